@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import INPUTS, SLOW, feature_scale, features, symmetric_product
+from mrctl.control.features import CHANNELS, FEATURES, SLOW, feature_scale, features, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, explained
 from mrctl.control.matching import SETTLED, histories, low_pass, note_sent, recall
 from mrctl.kernel import Array, Row, kernel
@@ -43,8 +43,7 @@ from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
-CHANNELS = 2
-FEATURES = INPUTS + 2  # the eight of the inverse dynamics, and gravity on a slope
+REGRESSORS = FEATURES + 2  # the eight of the inverse dynamics, and gravity on a slope
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt; it is smaller, since the geometry needs no motor
 OUTLIER = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
 BRIEF, LASTING = 0.25, 4.0  # s over which squared innovations are averaged, to detect a change of the plant
@@ -68,8 +67,8 @@ def regressor(twist: Array, rate: Array, direction: Array, half_track: float, sc
         scale: Scales of the first eight features, as from `feature_scale`, `(8,)`.
         phi: Out: φ and 1, `(11,)`.
     """
-    features(twist, rate, half_track, scale, phi[:INPUTS])
-    phi[INPUTS], phi[INPUTS + 1], phi[FEATURES] = direction[0], direction[1], 1.0
+    features(twist, rate, half_track, scale, phi[:FEATURES])
+    phi[FEATURES], phi[FEATURES + 1], phi[REGRESSORS] = direction[0], direction[1], 1.0
 
 
 @kernel
@@ -90,16 +89,16 @@ def predict(k: int, s: Row) -> None:
     symmetric_product(P, s.phi, Pphi)
     S = s.noise[k] ** 2 + s.scatter[k] ** 2 * s.variance[k]
     e = s.residual[k]
-    for i in range(FEATURES + 1):
+    for i in range(REGRESSORS + 1):
         S += s.phi[i] * Pphi[i]
         e -= s.phi[i] * a[i]
     e = max(-OUTLIER * np.sqrt(S), min(OUTLIER * np.sqrt(S), e))
     s.power[k, 0] += s.brief * (e * e - s.power[k, 0])
     s.power[k, 1] += s.lasting * (e * e - s.power[k, 1])
     e /= S
-    for i in range(FEATURES + 1):
+    for i in range(REGRESSORS + 1):
         a[i] = f[i] * (a[i] + Pphi[i] * e)
-        for j in range(FEATURES + 1):
+        for j in range(REGRESSORS + 1):
             P[i, j] = f[i] * f[j] * (P[i, j] - Pphi[i] * Pphi[j] / S) + (1 - f[i] * f[j]) * s.stationary[k, i, j]
 
 
@@ -117,16 +116,12 @@ def track(k: int, feedback: float, s: Row) -> None:
     if not abs(feedback) > s.dead_zone[k]:
         return
     a, P, phi, Pphi = s.a[k], s.P[k], s.past, s.Pphi
-    for i in range(FEATURES):
-        Pphi[i] = 0.0
-    for j in range(FEATURES):
-        for i in range(FEATURES):
-            Pphi[i] += P[j, i] * phi[j]
+    symmetric_product(P, phi[:REGRESSORS], Pphi)
     power = 0.0
-    for i in range(FEATURES):
+    for i in range(REGRESSORS):
         power += phi[i] * Pphi[i]
     if power > NOTHING:
-        for i in range(FEATURES):
+        for i in range(REGRESSORS):
             a[i] += s.step[k] / power * feedback * Pphi[i]
 
 
@@ -137,11 +132,11 @@ def reset_covariance(k: int, s: Row) -> None:
     This is covariance resetting (Goodwin and Sin, 1984). The second term is the step of the weights back to zero, in
     case the plant returns to the nominal one.
     """
-    for i in range(FEATURES + 1):
-        for j in range(FEATURES + 1):
+    for i in range(REGRESSORS + 1):
+        for j in range(REGRESSORS + 1):
             s.P[k, i, j] = s.stationary[k, i, j]
-    for i in range(FEATURES):
-        for j in range(FEATURES):
+    for i in range(REGRESSORS):
+        for j in range(REGRESSORS):
             s.P[k, i, j] += s.a[k, i] * s.a[k, j]
 
 
@@ -163,7 +158,7 @@ def detect_change(period: float, s: Row) -> None:
 def learned_voltage(a: Array, phi: Array) -> float:
     """Returns φᵀ a, without the disturbance."""
     total = 0.0
-    for i in range(FEATURES):
+    for i in range(REGRESSORS):
         total += a[i] * phi[i]
     return total
 
@@ -210,7 +205,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     s = rows[i]
     regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
     for k in range(CHANNELS):
-        voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, FEATURES]
+        voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, REGRESSORS]
 
 
 @kernel
@@ -243,8 +238,8 @@ def learn(
             added[k] = learned_voltage(s.a[k], s.phi_c) - added[k]
     else:
         for k in range(CHANNELS):
-            s.a[k, FEATURES] *= s.f[k, FEATURES]
-    s.norm = np.sqrt((s.a[:, :FEATURES] ** 2).sum())
+            s.a[k, REGRESSORS] *= s.f[k, REGRESSORS]
+    s.norm = np.sqrt((s.a[:, :REGRESSORS] ** 2).sum())
     return s.norm
 
 
@@ -287,8 +282,8 @@ MOTION = np.dtype(
 COMPOSITE = np.dtype(
     [
         # Settings, for the two channels; the second is in rad/s where it is steering.
-        ("f", "f8", (CHANNELS, FEATURES + 1)),  # diagonal of F: decay of a and, last, of d in a period
-        ("stationary", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # P₀, V²
+        ("f", "f8", (CHANNELS, REGRESSORS + 1)),  # diagonal of F: decay of a and, last, of d in a period
+        ("stationary", "f8", (CHANNELS, REGRESSORS + 1, REGRESSORS + 1)),  # P₀, V²
         ("step", "f8", CHANNELS),  # share of the feedback that the tracking term moves into the feedforward
         ("dead_zone", "f8", CHANNELS),  # feedback below which the tracking term is zero, V
         ("noise", "f8", CHANNELS),  # standard deviation of a sample, V
@@ -305,15 +300,15 @@ COMPOSITE = np.dtype(
         ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
         ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
         ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
-        ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
-        ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
+        ("phi", "f8", REGRESSORS + 1),  # (φ, 1) at the filtered motion
+        ("phi_c", "f8", REGRESSORS + 1),  # (φ, 1) at the command
         ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", FEATURES + 1),  # φ_c of the output that the feedback answers
+        ("past", "f8", REGRESSORS + 1),  # φ_c of the output that the feedback answers
         ("residual", "f8", CHANNELS),  # filtered voltage less the prior's, V
         # What is learned
-        ("a", "f8", (CHANNELS, FEATURES + 1)),  # weights of φ and, last, the disturbance d, V
-        ("P", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
-        ("Pphi", "f8", FEATURES + 1),  # P φ
+        ("a", "f8", (CHANNELS, REGRESSORS + 1)),  # weights of φ and, last, the disturbance d, V
+        ("P", "f8", (CHANNELS, REGRESSORS + 1, REGRESSORS + 1)),  # their covariance, V²
+        ("Pphi", "f8", REGRESSORS + 1),  # P φ
         ("power", "f8", (CHANNELS, 2)),  # brief and lasting mean square of the innovations, V²
         ("since", "f8"),  # time since the plant was found to have changed, s
         ("norm", "f8"),  # ‖a‖ of both channels, V
@@ -336,17 +331,17 @@ def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> A
         rigid: Whether channel two is steering.
         prior: Whether a model is the prior; otherwise the weights are as large as those of a model.
     """
-    c, scale = np.zeros((CHANNELS, FEATURES)), feature_scale(robot)
-    c[:, :INPUTS] = inverse_coefficients(robot).T * scale
+    c, scale = np.zeros((CHANNELS, REGRESSORS)), feature_scale(robot)
+    c[:, :FEATURES] = inverse_coefficients(robot).T * scale
     if rigid:
         c[1], c[1, 1] = 0.0, scale[1]  # the rotation itself
-    P = np.zeros((CHANNELS, FEATURES + 1, FEATURES + 1))
+    P = np.zeros((CHANNELS, REGRESSORS + 1, REGRESSORS + 1))
     unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
-    P[:, :FEATURES, :FEATURES] = settings.gain**2 * c[:, :, None] * c[:, None, :]
-    P[:, range(FEATURES), range(FEATURES)] += (settings.spread * unit[:, None]) ** 2
+    P[:, :REGRESSORS, :REGRESSORS] = settings.gain**2 * c[:, :, None] * c[:, None, :]
+    P[:, range(REGRESSORS), range(REGRESSORS)] += (settings.spread * unit[:, None]) ** 2
     if not prior:  # the geometry of a steering channel is known in any case
-        P[: 1 if rigid else 2, range(INPUTS), range(INPUTS)] += UNKNOWN**2
-    P[:, FEATURES, FEATURES] = (settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])) ** 2
+        P[: 1 if rigid else 2, range(FEATURES), range(FEATURES)] += UNKNOWN**2
+    P[:, REGRESSORS, REGRESSORS] = (settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])) ** 2
     return P
 
 
@@ -367,7 +362,7 @@ class CompositeAdaptation(Learner):
         unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
         for row, s in zip(rows, settings, strict=True):
             memory, brief_memory = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
-            row["f"][:, :FEATURES], row["f"][:, FEATURES] = memory, brief_memory
+            row["f"][:, :REGRESSORS], row["f"][:, REGRESSORS] = memory, brief_memory
             row["stationary"] = stationary(s, robot, rigid, loop.prior)
             row["step"] = s.step * np.array([1.0, STEERING_SHARE if rigid else 1.0])
             row["dead_zone"] = s.dead_zone * unit
@@ -375,19 +370,19 @@ class CompositeAdaptation(Learner):
             row["scatter"] = SCATTER * unit * (1.0, robot.half_track)
             row["brief"], row["lasting"] = period / (period + BRIEF), period / (period + LASTING)
             row["filter"] = period / (period + s.filter)
-        self.arrays = rows, feature_scale(robot), histories(len(settings), loop.delay, FEATURES + 1)
+        self.arrays = rows, feature_scale(robot), histories(len(settings), loop.delay, REGRESSORS + 1)
         self.restore(np.arange(len(settings)))
 
     @property
     def parameters(self) -> Array:
         """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
-        return self.rows["a"][:, :, :INPUTS].swapaxes(1, 2).copy()
+        return self.rows["a"][:, :, :FEATURES].swapaxes(1, 2).copy()
 
     def adopt(self, row: int, learned: Array) -> None:
         """Does as `Learner.adopt`, but leaves out slope and disturbance, which belong to another place and moment."""
         super().adopt(row, learned)
         s = self.rows[row]
-        local = [*range(INPUTS, FEATURES + 1)]
+        local = [*range(FEATURES, REGRESSORS + 1)]
         s["a"][:, local] = 0.0
         s["P"][:, local, :] = s["P"][:, :, local] = 0.0
         s["P"][:, local, local] = s["stationary"][:, local, local]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import INPUTS, OUTPUTS, feature_scale, features
+from mrctl.control.features import CHANNELS, FEATURES, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import histories, recall
 from mrctl.control.weights import initial_weights, load_weights, shapes
@@ -37,24 +37,24 @@ def places(units: int) -> tuple[int, int, int, int]:
 
     The laws index the flat weights: to make views of the five layers would take as long as the network itself.
     """
-    b1 = units * INPUTS
+    b1 = units * FEATURES
     W2 = b1 + units
-    b2 = W2 + OUTPUTS * units
-    return b1, W2, b2, b2 + OUTPUTS
+    b2 = W2 + CHANNELS * units
+    return b1, W2, b2, b2 + CHANNELS
 
 
 def by_columns(weights: Array) -> Array:
     """Returns flat weights of files and results, which begin with W₁, as those of the kernels, with W₁ᵀ, `(…, n)`."""
-    return _transposed(weights, rows=-1, columns=INPUTS)
+    return _transposed(weights, rows=-1, columns=FEATURES)
 
 
 def by_rows(weights: Array) -> Array:
     """Returns the inverse of `by_columns`."""
-    return _transposed(weights, rows=INPUTS, columns=-1)
+    return _transposed(weights, rows=FEATURES, columns=-1)
 
 
 def _transposed(weights: Array, rows: int, columns: int) -> Array:
-    size = (weights.shape[-1] - OUTPUTS * (INPUTS + 1)) // (INPUTS + 1 + OUTPUTS) * INPUTS
+    size = (weights.shape[-1] - CHANNELS * (FEATURES + 1)) // (FEATURES + 1 + CHANNELS) * FEATURES
     first = weights[..., :size].reshape(*weights.shape[:-1], rows, columns)
     return np.concatenate([np.swapaxes(first, -2, -1).reshape(*weights.shape[:-1], size), weights[..., size:]], axis=-1)
 
@@ -109,11 +109,11 @@ def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> N
     b1, W2, b2, W3 = places(units)
     for j in range(units):
         z = w[b1 + j]
-        for i in range(INPUTS):
+        for i in range(FEATURES):
             z += w[i * units + j] * x[i]
         hidden[j] = tanh(z)
-    for k in range(OUTPUTS):
-        direct = inner(w, W3 + k * INPUTS, x)
+    for k in range(CHANNELS):
+        direct = inner(w, W3 + k * FEATURES, x)
         output[k] = scale[k] * (HIDDEN_GAIN * inner(w, W2 + k * units, hidden) + BIAS_GAIN * w[b2 + k] + direct)
 
 
@@ -135,16 +135,16 @@ def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Arr
     """
     units = hidden.shape[0]
     b1, W2, b2, W3 = places(units)
-    for k in range(OUTPUTS):
+    for k in range(CHANNELS):
         gradient[b2 + k] = BIAS_GAIN * error[k]
-        for i in range(INPUTS):
-            gradient[W3 + k * INPUTS + i] = error[k] * x[i]
+        for i in range(FEATURES):
+            gradient[W3 + k * FEATURES + i] = error[k] * x[i]
         for j in range(units):
             gradient[W2 + k * units + j] = HIDDEN_GAIN * error[k] * hidden[j]
     for j in range(units):
         back = error[0] * w[W2 + j] + error[1] * w[W2 + units + j]
         gradient[b1 + j] = HIDDEN_GAIN * (1 - hidden[j] * hidden[j]) * back
-    for i in range(INPUTS):
+    for i in range(FEATURES):
         for j in range(units):
             gradient[i * units + j] = gradient[b1 + j] * x[i]
     delta = gradient[b1 : b1 + units]
@@ -173,7 +173,7 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
         gradient: Scratch, `(n,)`.
     """
     power = 0.0
-    for k in range(OUTPUTS):
+    for k in range(CHANNELS):
         s.error[k] = s.share[k] * feedback[k] / s.scale[k] if abs(feedback[k]) > s.dead_zone[k] else 0.0
         power += s.error[k] * s.error[k]
     if power == 0:
@@ -251,17 +251,17 @@ class Fel(Record):
 
 FEL = np.dtype(
     [
-        ("scale", "f8", OUTPUTS),  # feedforward for a network output of one, V (rad/s on a steering channel)
-        ("dead_zone", "f8", OUTPUTS),  # feedback below which nothing is learned, V (rad/s)
-        ("share", "f8", OUTPUTS),  # factor on the step in the two channels; a steering channel learns more slowly
+        ("scale", "f8", CHANNELS),  # feedforward for a network output of one, V (rad/s on a steering channel)
+        ("dead_zone", "f8", CHANNELS),  # feedback below which nothing is learned, V (rad/s)
+        ("share", "f8", CHANNELS),  # factor on the step in the two channels; a steering channel learns more slowly
         ("step", "f8"),  # μ; 0 keeps the weights as they are
         ("leak", "f8"),  # share of W − W₀ that is subtracted with each step
         ("bound", "f8"),  # largest ‖W − W₀‖
-        ("x", "f8", INPUTS),  # scaled features of the commanded motion
-        ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
+        ("x", "f8", FEATURES),  # scaled features of the commanded motion
+        ("output", "f8", CHANNELS),  # feedforward at x, V (rad/s)
         ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", INPUTS),  # delayed features: x of the output that the feedback answers
-        ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
+        ("past", "f8", FEATURES),  # delayed features: x of the output that the feedback answers
+        ("error", "f8", CHANNELS),  # e: feedback in units of the network's output
         ("norm", "f8"),  # ‖W − W₀‖
     ],
     align=True,
@@ -306,7 +306,7 @@ class FeedbackErrorLearning(Learner):
         self.weights = self.initial.copy()
         self.rows = fresh(settings, loop.rigid)
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
-        queue = histories(len(settings), loop.delay, INPUTS)
+        queue = histories(len(settings), loop.delay, FEATURES)
         self.arrays = self.rows, feature_scale(loop.robot), self.weights, self.initial, hidden, gradient, queue
 
     @classmethod

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.func import functional_call, stack_module_state, vjp, vmap
 
-from mrctl.control.features import INPUTS, OUTPUTS, feature_matrix, feature_scale
+from mrctl.control.features import CHANNELS, FEATURES, feature_matrix, feature_scale
 from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, REGULARISATION, Fel, fresh
 from mrctl.control.matching import histories
 from mrctl.kernel import Array
@@ -24,9 +24,9 @@ class Network(nn.Module):
     def __init__(self, hidden: int = 24) -> None:
         """Takes the number of hidden units; the layers behind them start at zero."""
         super().__init__()
-        self.hidden = nn.Linear(INPUTS, hidden, dtype=torch.float64)
-        self.output = nn.Linear(hidden, OUTPUTS, dtype=torch.float64)
-        self.direct = nn.Linear(INPUTS, OUTPUTS, bias=False, dtype=torch.float64)
+        self.hidden = nn.Linear(FEATURES, hidden, dtype=torch.float64)
+        self.output = nn.Linear(hidden, CHANNELS, dtype=torch.float64)
+        self.direct = nn.Linear(FEATURES, CHANNELS, bias=False, dtype=torch.float64)
         for parameter in (self.output.weight, self.output.bias, self.direct.weight):
             nn.init.zeros_(parameter)
 
@@ -67,10 +67,10 @@ class ModuleLearning:
         settings = settings or Fel()
         self._module = copy.deepcopy(module).double().eval()
         try:
-            shape = tuple(self._module(torch.zeros(INPUTS, dtype=torch.float64)).shape)
+            shape = tuple(self._module(torch.zeros(FEATURES, dtype=torch.float64)).shape)
         except RuntimeError as error:
             raise ValueError(f"module: does not map 8 features to 2 channels: {error}") from None
-        if shape != (OUTPUTS,):
+        if shape != (CHANNELS,):
             raise ValueError(f"module: maps 8 features to shape {shape}, not to 2 channels")
         self._half_track = robot.half_track
         self._scale = feature_scale(robot)
@@ -79,8 +79,8 @@ class ModuleLearning:
             torch.tensor(start[name].copy()) for name in ("scale", "dead_zone", "share")
         )
         self._step, self._leak, self._bound = float(start["step"]), float(start["leak"]), float(start["bound"])
-        self._features = np.zeros((size, INPUTS))
-        self._queue, self._tick = histories(size, 0, INPUTS), np.zeros(size, int)
+        self._features = np.zeros((size, FEATURES))
+        self._queue, self._tick = histories(size, 0, FEATURES), np.zeros(size, int)
         stacked, _ = stack_module_state([self._module] * size)
         self.initial = {name: value.detach().clone() for name, value in stacked.items()}
         self.state = {name: value.clone() for name, value in self.initial.items()}
@@ -88,7 +88,7 @@ class ModuleLearning:
 
     def reset(self, period: float, delay: float) -> None:
         """Takes the control period and the delay of the loop in s; see `Feedforward.reset`."""
-        self._queue = histories(len(self._tick), round(delay / period), INPUTS)
+        self._queue = histories(len(self._tick), round(delay / period), FEATURES)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to the parameters of the module."""

@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import INPUTS
+from mrctl.control.features import FEATURES
 from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, explained, prior_voltage
 from mrctl.control.matching import MATCHED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
@@ -94,7 +94,7 @@ def learn(
     """One measurement, which goes on while the robot must not learn: the voltage is the one after the limits."""
     rows, queue = arrays
     s = rows[i]
-    for j in range(INPUTS):
+    for j in range(FEATURES):
         s.prior.c[j, 0], s.prior.c[j, 1] = prior.c[j, 0], prior.c[j, 1]
     note_sent(voltage, command, robot.rigid, s.sent)
     measure(twist, robot.rigid, period, queue[i], s)

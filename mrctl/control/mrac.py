@@ -64,14 +64,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.cholesky import factor, forward, solve
-from mrctl.control.features import INPUTS, SLOW, feature_scale, features, linear, symmetric_product
+from mrctl.control.features import FEATURES, SLOW, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 
-SIGNALS = INPUTS + 2  # filtered signals: the features and the voltage of the two channels
+SIGNALS = FEATURES + 2  # filtered signals: the features and the voltage of the two channels
 NEWTON, NEAR = 100, 1e-6  # largest number of steps of the projection; share by which its result may exceed the ball
 
 
@@ -86,17 +86,17 @@ def predict(s: Row) -> None:
     Args:
         s: In and out: a record of `MRAC`.
     """
-    for i in range(INPUTS):
-        for j in range(INPUTS):
+    for i in range(FEATURES):
+        for j in range(FEATURES):
             s.M[i, j] += s.w[i] * s.w[j] / s.r - s.forgetting * s.M[i, j]
         s.M[i, i] += s.forgetting * s.least
     factor(s.M, s.L)
     solve(s.L, s.w, s.direction)
     for k in range(2):
         innovation = s.residual[k]
-        for i in range(INPUTS):
+        for i in range(FEATURES):
             innovation -= s.w[i] * s.b[i, k]
-        for i in range(INPUTS):
+        for i in range(FEATURES):
             s.b[i, k] += s.direction[i] * innovation / s.r
 
 
@@ -109,7 +109,7 @@ def track(k: int, s: Row) -> None:
         s: In and out: a record of `MRAC`.
     """
     solve(s.L, s.phi_c, s.direction)
-    for i in range(INPUTS):
+    for i in range(FEATURES):
         s.b[i, k] += s.tracking[k] * s.direction[i] * s.error[k]
 
 
@@ -131,7 +131,7 @@ def confine(k: int, s: Row) -> None:
         return
     solve(s.L, b, s.direction)
     share = min(s.leak * min(size / radius - 1, 1.0), (size - radius) * size / dot(b, s.direction))
-    for i in range(INPUTS):
+    for i in range(FEATURES):
         b[i] -= share * s.direction[i]
     project(s.M, b, 2 * radius, s.shifted, s.direction)
 
@@ -198,7 +198,7 @@ def filter_motion(command: Array, twist: Array, period: float, queue: Rows, scal
         Whether the filters have forgotten how they began.
     """
     known = match(twist, s.derivative, s.sent, period, queue, s.matched)
-    for j in range(INPUTS):
+    for j in range(FEATURES):
         s.before[j] = s.x[j]
     features(s.matched.twist, s.zero, robot.half_track, scale, s.x)
     if not known:
@@ -206,14 +206,14 @@ def filter_motion(command: Array, twist: Array, period: float, queue: Rows, scal
     for j in range(SIGNALS):
         if j == 2 or j == 3:
             signal = s.matched.rate[j - 2] / scale[j]
-        elif j < INPUTS:
+        elif j < FEATURES:
             signal = (s.x[j] + s.before[j]) / 2
         else:
-            signal = s.matched.acted[j - INPUTS]
+            signal = s.matched.acted[j - FEATURES]
         if s.age == 0:
             s.once[j] = s.twice[j] = signal
         low_pass(signal, j, s.share, s.once, s.twice)
-        if j < INPUTS:
+        if j < FEATURES:
             s.w[j] = s.twice[j]
     s.age += s.share
     return s.age > SETTLED
@@ -245,8 +245,8 @@ def learn(
     if settled and moves and frozen == 0:
         for k in range(2):
             s.error[k] = command[k] - twist[k]
-            s.residual[k] = s.twice[INPUTS + k]
-            for j in range(INPUTS):
+            s.residual[k] = s.twice[FEATURES + k]
+            for j in range(FEATURES):
                 s.residual[k] -= s.w[j] * scale[j] * prior.c[j, k]
         if robot.rigid:
             s.residual[1] -= s.w[1] * scale[1]
@@ -307,20 +307,20 @@ MRAC = np.dtype(
         ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
         ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
         ("output", "f8", 2),  # φ(x_c, ẋ_c)ᵀ b after a step, V
-        ("x", "f8", INPUTS),  # scaled features of the measured twist without acceleration
-        ("before", "f8", INPUTS),  # the same one period ago
+        ("x", "f8", FEATURES),  # scaled features of the measured twist without acceleration
+        ("before", "f8", FEATURES),  # the same one period ago
         ("once", "f8", SIGNALS),  # features and voltages after the first filter
         ("twice", "f8", SIGNALS),  # H of features and voltages
         ("age", "f8"),  # time since the filters began over T + h
-        ("w", "f8", INPUTS),  # filtered features
-        ("phi_c", "f8", INPUTS),  # scaled features of the commanded motion
+        ("w", "f8", FEATURES),  # filtered features
+        ("phi_c", "f8", FEATURES),  # scaled features of the commanded motion
         ("residual", "f8", 2),  # filtered voltage less that of the prior, V
         ("error", "f8", 2),  # x_c − x, m/s and rad/s
-        ("b", "f8", (INPUTS, 2)),  # â − a_0, V
-        ("M", "f8", (INPUTS, INPUTS)),  # P⁻¹, the inverse of the gain of least squares, 1/V²
-        ("L", "f8", (INPUTS, INPUTS)),  # its factor, M = L Lᵀ, 1/V
-        ("shifted", "f8", (INPUTS, INPUTS)),  # scratch of the projection, 1/V²
-        ("direction", "f8", INPUTS),  # scratch: P times a vector, V² and V
+        ("b", "f8", (FEATURES, 2)),  # â − a_0, V
+        ("M", "f8", (FEATURES, FEATURES)),  # P⁻¹, the inverse of the gain of least squares, 1/V²
+        ("L", "f8", (FEATURES, FEATURES)),  # its factor, M = L Lᵀ, 1/V
+        ("shifted", "f8", (FEATURES, FEATURES)),  # scratch of the projection, 1/V²
+        ("direction", "f8", FEATURES),  # scratch: P times a vector, V² and V
         ("norm", "f8"),  # ‖â − a_0‖ of both channels, V
     ],
     align=True,
@@ -345,7 +345,7 @@ class ModelReferenceAdaptive(Learner):
         weight = np.array([emf[0], STEERING_SHARE if rigid else emf[1]])
         for row, s in zip(rows, settings, strict=True):
             row["r"], row["forgetting"] = s.noise**2 / period, min(period / s.memory, 0.5)
-            row["least"], row["M"] = s.spread**-2, s.spread**-2 * np.eye(INPUTS)
+            row["least"], row["M"] = s.spread**-2, s.spread**-2 * np.eye(FEATURES)
             row["tracking"] = s.tracking * period * weight
             row["leak"], row["radius"] = s.leak * period, s.radius * robot.supply * unit
             row["share"], row["hand_over"] = period / (period + s.filter), s.hand_over

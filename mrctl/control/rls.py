@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import feature_scale, features, linear
+from mrctl.control.features import FEATURES, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
@@ -32,15 +32,13 @@ def update(x: Array, feedback: Array, s: Row) -> None:
     """
     if abs(feedback[0]) <= s.dead_zone and abs(feedback[1]) <= s.dead_zone:
         return
+    symmetric_product(s.P, x, s.gain)
     power = 0.0
-    for i in range(8):
-        s.gain[i] = 0.0
-        for j in range(8):
-            s.gain[i] += s.P[i, j] * x[j]
+    for i in range(FEATURES):
         power += x[i] * s.gain[i]
     total = max(1.0 + power, power / s.step)
-    for i in range(8):
-        for j in range(8):
+    for i in range(FEATURES):
+        for j in range(FEATURES):
             s.P[i, j] -= s.gain[i] * s.gain[j] / total
         if s.P[i, i] < s.bound:
             s.P[i, i] += s.drift

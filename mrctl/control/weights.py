@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mrctl import __version__
-from mrctl.control.features import INPUTS, OUTPUTS
+from mrctl.control.features import CHANNELS, FEATURES
 from mrctl.kernel import Array
 from mrctl.record import InputError, reading
 
@@ -19,11 +19,11 @@ LARGEST = 64 * 2**20  # bytes of the arrays of a file
 def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
     """Returns names and shapes of the weights, in the order of the flat vector; `fel_torch.Network` has the same."""
     return {
-        "hidden.weight": (hidden, INPUTS),
+        "hidden.weight": (hidden, FEATURES),
         "hidden.bias": (hidden,),
-        "output.weight": (OUTPUTS, hidden),
-        "output.bias": (OUTPUTS,),
-        "direct.weight": (OUTPUTS, INPUTS),
+        "output.weight": (CHANNELS, hidden),
+        "output.bias": (CHANNELS,),
+        "direct.weight": (CHANNELS, FEATURES),
     }
 
 
@@ -48,7 +48,7 @@ def flatten(layers: dict[str, Array]) -> Array:
 
 def unflatten(weights: Array) -> dict[str, Array]:
     """Returns the flat vector as named weights."""
-    hidden = (len(weights) - OUTPUTS * (INPUTS + 1)) // (INPUTS + 1 + OUTPUTS)
+    hidden = (len(weights) - CHANNELS * (FEATURES + 1)) // (FEATURES + 1 + CHANNELS)
     layers, start = {}, 0
     for name, shape in shapes(hidden).items():
         stop = start + int(np.prod(shape))
@@ -63,7 +63,7 @@ def save_weights(path: str | Path, weights: Array) -> None:
         InputError: These are no weights of `fel`, or the file cannot be written.
     """
     flat = np.asarray(weights)
-    units, left = divmod(flat.size - OUTPUTS * (INPUTS + 1), INPUTS + 1 + OUTPUTS)
+    units, left = divmod(flat.size - CHANNELS * (FEATURES + 1), FEATURES + 1 + CHANNELS)
     if flat.ndim != 1 or flat.dtype.kind not in "fiu" or units < 1 or left:
         kind = f"shape {flat.shape}" if flat.dtype.kind in "fiu" else f"type {type(weights).__name__}"
         raise InputError(

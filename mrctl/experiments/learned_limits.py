@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from mrctl.control.features import INPUTS, feature_scale
+from mrctl.control.features import FEATURES, feature_scale
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import PLANTS as SHARED
 from mrctl.experiments.mission_suite import ROOMY, SHAPE, TIE, Mode, drawn
@@ -145,7 +145,7 @@ def limits_of(run: xr.Dataset, robot: Robot) -> Limits:
     (scenario,) = scenarios_of(run)
     ((name, shape), *_) = kept(scenario).items()
     assert name == "a" and scenario.prior == "model"
-    weights = run["weights"].values[: int(np.prod(shape))].reshape(shape)[:, :INPUTS]
+    weights = run["weights"].values[: int(np.prod(shape))].reshape(shape)[:, :FEATURES]
     adapted = inverse_coefficients(robot)
     channels = 1 if arranged(scenario).steering == "rigid" else 2
     adapted[:, :channels] += (weights[:channels] / feature_scale(robot)).T

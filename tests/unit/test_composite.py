@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from mrctl.control.composite import (
     COMPOSITE,
-    FEATURES,
+    REGRESSORS,
     SCATTER,
     STEERING_DISTURBANCE,
     Composite,
@@ -24,7 +24,7 @@ from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_righ
 
 RNG = np.random.default_rng(8)
 PERIOD = 0.01
-N = FEATURES
+N = REGRESSORS
 
 
 def numbers(*shape, bound=3.0):
@@ -186,7 +186,7 @@ def test_change_of_the_plant(robot, changed):
 
     def watch(_):
         spread.append(openness(pupil))
-        learned.append((pupil.rows["a"][0, :, :FEATURES] ** 2).sum(1))
+        learned.append((pupil.rows["a"][0, :, :REGRESSORS] ** 2).sum(1))
 
     assert (settled < 0.5 * openness(stage(robot))).all()
     drive(pupil, plant.model_copy(update=changed), 3, watch=watch)
@@ -204,11 +204,11 @@ def test_push(robot):
     """What looks like another plant for a moment, and is none, takes nothing of what was known."""
     pupil, plant = stage(robot), robot.model_copy(update={"mass": 30.0, "supply": 1e3})
     drive(pupil, plant, 30)
-    weights, certain = pupil.rows["a"][0, :, :FEATURES].copy(), openness(pupil)
+    weights, certain = pupil.rows["a"][0, :, :REGRESSORS].copy(), openness(pupil)
     drive(pupil, plant, 0.3, disturbance=0.3)
     assert (openness(pupil) > 5 * certain).all()
     drive(pupil, plant, 5)
-    assert np.linalg.norm(pupil.rows["a"][0, :, :FEATURES] - weights) < 0.2 * np.linalg.norm(weights)
+    assert np.linalg.norm(pupil.rows["a"][0, :, :REGRESSORS] - weights) < 0.2 * np.linalg.norm(weights)
 
 
 @pytest.mark.parametrize("rigid", [False, True])
@@ -233,11 +233,11 @@ def test_noise_counts(robot, channel, rigid):
     per_speed = scale * SCATTER * [1.0, robot.half_track]
     noise = (scale * settings.noise) ** 2 + per_speed**2 * pupil.rows["variance"][0]
     pupil.rows["P"][:] = 0.0
-    pupil.rows["P"][0, :, FEATURES, FEATURES] = before = 0.01
+    pupil.rows["P"][0, :, REGRESSORS, REGRESSORS] = before = 0.01
     pupil.learn(np.zeros((1, 2)), np.zeros(1), start, voltage)
     fading = np.exp(-2 * PERIOD / settings.disturbance_memory)
     deviation = settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])
-    found = (pupil.rows["P"][0, :, FEATURES, FEATURES] - (1 - fading) * deviation**2) / fading
+    found = (pupil.rows["P"][0, :, REGRESSORS, REGRESSORS] - (1 - fading) * deviation**2) / fading
     variance = found * before / (before - found)
     np.testing.assert_allclose(variance, noise, rtol=0.05)
 
@@ -275,14 +275,14 @@ def test_gates(robot):
         for _ in range(100):  # until the filters are at rest too
             pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2)))
         kept = pupil.rows["a"].copy()
-        assert kept[..., :FEATURES].any()
-        kept[..., FEATURES] = 0.2
+        assert kept[..., :REGRESSORS].any()
+        kept[..., REGRESSORS] = 0.2
         pupil.rows["a"][:] = kept
         for _ in range(50):
             assert not pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2))).any()
-        np.testing.assert_array_equal(pupil.rows["a"][..., :FEATURES], kept[..., :FEATURES])
+        np.testing.assert_array_equal(pupil.rows["a"][..., :REGRESSORS], kept[..., :REGRESSORS])
         faded = 0.2 * np.exp(-50 * PERIOD / Composite().disturbance_memory)
-        np.testing.assert_allclose(pupil.rows["a"][..., FEATURES], faded, rtol=1e-9)
+        np.testing.assert_allclose(pupil.rows["a"][..., REGRESSORS], faded, rtol=1e-9)
 
 
 def test_what_it_added(robot):
@@ -292,7 +292,7 @@ def test_what_it_added(robot):
     command, derivative = np.array([[0.9, 0.4]]), np.array([[0.3, -0.5]])
 
     def learned():
-        return pupil.output(command, derivative) - pupil.rows["a"][..., FEATURES]
+        return pupil.output(command, derivative) - pupil.rows["a"][..., REGRESSORS]
 
     before = learned().copy()
     straight = np.array([[0.9, 0.0]])  # the output also turns with the heading

@@ -13,7 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 import mrctl
-from mrctl.control.features import INPUTS, feature_matrix, feature_scale
+from mrctl.control.features import FEATURES, feature_matrix, feature_scale
 from mrctl.control.feedforward import Loop
 from mrctl.control.fel import (
     BIAS_GAIN,
@@ -281,7 +281,7 @@ def test_flat_weights(hidden):
     np.testing.assert_array_equal(flatten(layers), weights)
     for several in (weights, np.stack([weights, -weights])):  # of one robot and of two
         np.testing.assert_array_equal(by_rows(by_columns(several)), several)
-    columns = by_columns(weights)[: hidden * INPUTS]
+    columns = by_columns(weights)[: hidden * FEATURES]
     np.testing.assert_array_equal(columns, layers["hidden.weight"].T.ravel())
     theirs = {name: tuple(value.shape) for name, value in Network(hidden).state_dict().items()}
     assert {name: layer.shape for name, layer in layers.items()} == theirs == shapes(hidden)

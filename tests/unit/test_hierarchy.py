@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl.control.composite import FEATURES, CompositeAdaptation
+from mrctl.control.composite import REGRESSORS, CompositeAdaptation
 from mrctl.control.feedforward import NoLearner, Prior
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.guard import Guard
@@ -66,7 +66,7 @@ def weights(hierarchy):
     """What a learner knows of its robots, `(B, …)`; a disturbance, which fades while nothing is learned, is no part."""
     stage = hierarchy.learner
     if isinstance(stage, CompositeAdaptation):
-        return stage.rows["a"][..., :FEATURES]
+        return stage.rows["a"][..., :REGRESSORS]
     return stage.rows["theta"] if isinstance(stage, RecursiveLeastSquares) else stage.weights
 
 

@@ -365,7 +365,7 @@ def test_constants_of_kernels():
         for function in module.kernels:
             for name in constants_in(function):
                 found[path.stem, function.name, name] = module.sources(name)
-    assert {("fel", "network", "HIDDEN_GAIN"), ("fel", "network", "INPUTS")} <= found.keys()
+    assert {("fel", "network", "HIDDEN_GAIN"), ("fel", "network", "FEATURES")} <= found.keys()
     assert found["steering", "allocate", "SIGN_SPEED"] == {PACKAGE / "control" / "features.py"}
     for place, sources in found.items():
         assert sources <= set(files), place
