@@ -72,8 +72,10 @@ def suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | No
 
 def show(found: Report, out: Path | None, json: bool) -> None:
     """Prints a report, writes its files, and prints where they are; JSON stays alone on stdout."""
-    print(found.text, flush=True)
-    found.save()
+    try:
+        print(found.text, flush=True)
+    finally:  # also where nobody reads what is printed
+        found.save()
     if out is not None:
         print(f"The files are in {out}.", file=sys.stderr if json else sys.stdout)
 

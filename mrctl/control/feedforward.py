@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.features import features, linear
 from mrctl.control.nominal import nominal
+from mrctl.control.weights import named
 from mrctl.kernel import Array, Kernel, Row, Rows, flat, kernel
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
@@ -236,11 +237,8 @@ class Learner(ABC):
 
     def adopt(self, row: int, learned: Array) -> None:
         """Lets one robot start from what another one has learned, a row of its `adapted`."""
-        start = 0
-        for name in self.learned:
-            place = self.rows[name][row]
-            place[...] = learned[start : start + place.size].reshape(place.shape)
-            start += place.size
+        for name, values in named(learned, {name: self.rows[name].shape[1:] for name in self.learned}).items():
+            self.rows[name][row] = values
 
     def take(self, row: int, other: Learner) -> None:
         """Copies the memory of a learner of the same kind, for one robot, into a row of this one."""

@@ -20,7 +20,7 @@ from pydantic import Field
 from mrctl.control.features import CHANNELS, FEATURES, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import histories, recall
-from mrctl.control.weights import initial_weights, load_weights, shapes
+from mrctl.control.weights import hidden_units, initial_weights, load_weights, shapes
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 
@@ -54,7 +54,7 @@ def by_rows(weights: Array) -> Array:
 
 
 def _transposed(weights: Array, rows: int, columns: int) -> Array:
-    size = (weights.shape[-1] - CHANNELS * (FEATURES + 1)) // (FEATURES + 1 + CHANNELS) * FEATURES
+    size = hidden_units(weights.shape[-1])[0] * FEATURES
     first = weights[..., :size].reshape(*weights.shape[:-1], rows, columns)
     return np.concatenate([np.swapaxes(first, -2, -1).reshape(*weights.shape[:-1], size), weights[..., size:]], axis=-1)
 

@@ -1,4 +1,4 @@
-"""The velocity controller: PID on linear and yaw rate, with gains by `design` or by the IMC rule."""
+"""The velocity controller: PID on linear velocity and yaw rate, with gains by `design` or by the IMC rule."""
 
 from __future__ import annotations
 

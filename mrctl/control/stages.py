@@ -42,9 +42,10 @@ class Motion(Protocol):
     `mrctl.theory.references`, before the first `output` that is given this reference. A motion controller with such a
     method may go along its reference at its own pace: the run does not fail where the robot is far from it.
 
-    It may have a method `tune(row, gains)`, which gets the index of a robot and the gains of Kanayama's law that it has
-    from now on, a `mrctl.Kanayama` in which all are set: those of the scenario after `assign`, and others when an event
-    changes them; for an event at the start that is before `reset`. Without it, such an event is refused.
+    It may have a method `tune(row, gains)`, which gets the index of a robot and its gains of Kanayama's law, a
+    `mrctl.Kanayama` in which all are set, designed where the scenario sets none. It is called once for each robot after
+    `assign`, and again when an event changes the gains, which for an event at the start is before `reset`. Without this
+    method, events that change the gains are refused.
 
     It may have a member `followed`, a float64 array `(B, 7)`: the reference that it follows in place of the given one,
     in the same units. Its twist then passes the prefilter without lag, as that of the given one does otherwise. It is

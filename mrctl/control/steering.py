@@ -60,16 +60,10 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
 
 
 @kernel
-def allocate(
+def steer(
     twist: Array, acceleration: Array, feedback: Array, feedforward: Array, period: float, robot: Row, s: Row
 ) -> None:
-    """Voltages and steering from feedback plus feedforward, and the excess of the limits.
-
-        U_r,l = U_Σ ± U_Δ,    φ from `scrub_free` at the commanded V and θ̇
-
-    - `compliant` and `caster`: U_Δ is the second channel.
-    - `rigid`: the second channel is added to the θ̇ that determines φ, and U_Δ is the electronic differential
-      k_E N D θ̇/r plus half the difference of the friction terms of the two drives.
+    """Angle and rate of the fork: `scrub_free` at the commanded V and θ̇, and if rigid the second channel beside θ̇.
 
     Args:
         twist: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
@@ -78,7 +72,31 @@ def allocate(
         feedforward: Channels of the feedforward in the same units, `(2,)`.
         period: Control period in s.
         robot: The nominal robot, a record of `NOMINAL`.
-        s: In and out: a record of `ALLOCATION`, all of whose fields are the result.
+        s: In and out: a record of `ALLOCATION`, whose `angle` and `rate` are the result, without limits.
+    """
+    omega = twist[1]
+    if robot.rigid:
+        omega += feedback[1] + feedforward[1]
+    scrub_free(twist[0], omega, acceleration[0], acceleration[1], period, robot, s)
+
+
+@kernel
+def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, robot: Row, s: Row) -> None:
+    """Voltages and steering command within their limits, from feedback plus feedforward and the fork's angle.
+
+        U_r,l = U_Σ ± U_Δ
+
+    - `compliant` and `caster`: U_Δ is the second channel.
+    - `rigid`: the second channel is a θ̇ that the fork makes, and U_Δ is the electronic differential k_E N D θ̇/r plus
+      half the difference of the friction terms of the two drives.
+
+    Args:
+        twist: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
+        feedback: Channels of the feedback, as for `steer`, `(2,)`.
+        feedforward: Channels of the feedforward in the same units, `(2,)`.
+        period: Control period in s.
+        robot: The nominal robot, a record of `NOMINAL`.
+        s: In and out: a record of `ALLOCATION` with the fork's `angle` and `rate`, all of whose fields are the result.
     """
     v, omega = twist[0], twist[1]
     s.excess[1], s.saturated = 0.0, False
@@ -93,7 +111,6 @@ def allocate(
         s.feedback[0], s.feedback[1] = feedback[0] - feedback[1], feedback[0] + feedback[1]
     s.feedforward[0], s.feedforward[1] = feedforward[0] - differential, feedforward[0] + differential
 
-    scrub_free(v, omega, acceleration[0], acceleration[1], period, robot, s)
     if abs(s.angle) > robot.steering_limit:
         s.angle = robot.steering_limit if s.angle > 0 else -robot.steering_limit
         s.rate = 0.0

@@ -48,12 +48,21 @@ def flatten(layers: dict[str, Array]) -> Array:
 
 def unflatten(weights: Array) -> dict[str, Array]:
     """Returns the flat vector as named weights."""
-    hidden = (len(weights) - CHANNELS * (FEATURES + 1)) // (FEATURES + 1 + CHANNELS)
-    layers, start = {}, 0
-    for name, shape in shapes(hidden).items():
+    return named(weights, shapes(hidden_units(len(weights))[0]))
+
+
+def hidden_units(size: int) -> tuple[int, int]:
+    """Returns the number of hidden units of a flat vector of this size, and how many numbers are left over."""
+    return divmod(size - CHANNELS * (FEATURES + 1), FEATURES + 1 + CHANNELS)
+
+
+def named(flat: Array, layout: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Returns views of a flat vector as arrays of these names and shapes, which follow each other in it."""
+    found, start = {}, 0
+    for name, shape in layout.items():
         stop = start + int(np.prod(shape))
-        layers[name], start = weights[start:stop].reshape(shape), stop
-    return layers
+        found[name], start = flat[start:stop].reshape(shape), stop
+    return found
 
 
 def save_weights(path: str | Path, weights: Array) -> None:
@@ -63,7 +72,7 @@ def save_weights(path: str | Path, weights: Array) -> None:
         InputError: These are no weights of `fel`, or the file cannot be written.
     """
     flat = np.asarray(weights)
-    units, left = divmod(flat.size - CHANNELS * (FEATURES + 1), FEATURES + 1 + CHANNELS)
+    units, left = hidden_units(flat.size)
     if flat.ndim != 1 or flat.dtype.kind not in "fiu" or units < 1 or left:
         kind = f"shape {flat.shape}" if flat.dtype.kind in "fiu" else f"type {type(weights).__name__}"
         raise InputError(

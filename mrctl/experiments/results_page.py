@@ -206,7 +206,7 @@ def suite_text(table: Table, everything: str) -> str:
         f"<details><summary>{title}</summary>\n\n{says}\n\n{text}\n\n</details>"
         for title, (says, _, text) in by_title.items()
     ]
-    title = f"RMSE of the last lap ({table['mode']}), mean [95 % bootstrap interval]:"
+    title = f"RMSE of the last lap ({table['mode']}), mean [95 % confidence interval]:"
     return "\n\n".join([says, title, short, *folded])
 
 

@@ -254,7 +254,9 @@ def _course(seed: int) -> Waypoints:
 
 
 def score(errors: Array, yardstick: Array) -> Array:
-    """Returns the weighted logarithm of the ratio to `model` in each world, `(n,)`; the objective is its mean.
+    """Returns the weighted logarithm of the ratio to `model` in each of the n worlds that `model` drives, `(n,)`.
+
+    The objective is its mean.
 
     Args:
         errors: Errors by world and metric of `METRICS`, `(worlds, 3)`; NaN where the run failed.

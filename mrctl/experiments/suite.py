@@ -195,7 +195,7 @@ def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
 def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     """Computes the statistics of the tables: a row for each case and feedforward, in the order of `PARTS`.
 
-    A row holds for lap 1, all laps and the last lap: the mean with its 95 % bootstrap interval; the floor; the mean
+    A row holds for lap 1, all laps and the last lap: the mean with its 95 % confidence interval; the floor; the mean
     difference from PID and from `model` in the same run; and the probability of beating each of the others in the same
     run, where two errors are a tie if they differ by no more than `Floor.tie`. In `random`, where one world
     would dominate a mean, medians replace the means. For the last lap a row also holds the mean of the worst 5 %

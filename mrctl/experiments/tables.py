@@ -58,7 +58,8 @@ class Report(NamedTuple):
     text: str
     """What was found, as text or JSON."""
     ended: str
-    """How the run ended, or whether it departs from a saved one."""
+    """Of `navigate` the outcome of the first robot; of `run` when and why it failed, or ""; of a run that was repeated
+    the signal in which it departs from the saved one, or ""."""
     save: Callable[[], None]
     """Writes the files; does nothing where the command writes none."""
 
@@ -87,7 +88,7 @@ def word_of(wins: Superiority, better: str, worse: str) -> str:
 
 
 def centre_cell(samples: Array, digits: int, median: bool = False) -> str:
-    """Returns the mean or the median of the finite samples with its 95 % bootstrap interval.
+    """Returns the mean or the median of the finite samples with its 95 % interval, as from `bootstrap_interval`.
 
     One sample has no interval, and – stands for none.
     """

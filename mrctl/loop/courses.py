@@ -69,14 +69,6 @@ class Courses:
         """Returns the references of the same group with further events."""
         return Courses(scenarios, self._preview)
 
-    def restart(self, row: int, tick: int) -> None:
-        """Begins the course of one robot again at a control tick.
-
-        Raises:
-            ValueError: These courses were not made for that.
-        """
-        raise ValueError("restart: the simulation was not made with `restarting`")
-
     def _sampled(self, tick: int) -> tuple[Rows, Rows]:
         """Returns what `at` returns."""
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
@@ -108,8 +100,8 @@ class RestartingCourses(Courses):
     def extended(self, scenarios: Sequence[Scenario]) -> Courses:
         raise ValueError("add: robots that begin again keep their references")
 
-    @override
     def restart(self, row: int, tick: int) -> None:
+        """Begins the course of one robot again at a control tick."""
         self._start[row], self._tick = tick, -1
 
     @override

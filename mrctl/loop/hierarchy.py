@@ -26,7 +26,7 @@ from mrctl.control.limiter import LIMITER, limit
 from mrctl.control.nominal import nominal
 from mrctl.control.pid import PID, Pid, pid
 from mrctl.control.rejection import Peaks, rejection
-from mrctl.control.steering import ALLOCATION, allocate, take_loss
+from mrctl.control.steering import ALLOCATION, allocate, steer, take_loss
 from mrctl.kernel import Array, Held, Row, Rows, held, kernel
 from mrctl.loop.learned import load_learned
 from mrctl.loop.user_stages import UserFeedforward, UserStage
@@ -87,9 +87,9 @@ def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
 
 
 @kernel
-def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> bool:
-    """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
-    command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
+def watch(seen: Row, model: Row, robot: Row, period: float, s: Row) -> None:
+    """The watch on the velocity loop, and the guard, which limits the feedforward or replaces it."""
+    command, derivative = s.limiter.command, s.limiter.derivative
     if s.guard.on or s.delay.on:
         prior_voltage(command, derivative, model, s.nominal)
     watch_delay(s.feedback, s.guard.output, s.nominal, period, s.delay)
@@ -97,7 +97,13 @@ def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> 
         s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.voltage, period, robot.rigid, s.pid.integral,
         s.feedback,
     )  # fmt: skip
-    allocate(command, derivative, s.feedback, s.guard.output, period, robot, a)
+
+
+@kernel
+def apply_voltages(seen: Row, robot: Row, period: float, s: Row) -> bool:
+    """Allocation: from feedback, feedforward and the fork's angle to commands; returns whether they are finite."""
+    a = s.allocation
+    allocate(s.limiter.command, s.feedback, s.guard.output, period, robot, a)
     take_loss(seen.lost, robot.rigid, a)
     s.slips = not seen.slip <= SLIPS  # NaN counts as slip
     s.frozen = 1.0 if a.saturated or s.learning_off or s.guard.frozen or s.slips else 0.0
@@ -152,7 +158,9 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
         respond(i, command, derivative, robot[0], arrays, s.feedforward)
         for k in range(2):
             s.feedforward[k] += s.prior[k]
-        finite &= apply_voltages(measured, model[0], robot[0], period, s)
+        watch(measured, model[0], robot[0], period, s)
+        steer(command, derivative, s.feedback, s.guard.output, period, robot[0], s.allocation)
+        finite &= apply_voltages(measured, robot[0], period, s)
         s.weight_norm = learn_one(
             i, command, s.guard.teaching, s.frozen, measured.twist, s.voltage, period, robot[0], prior[i], arrays,
             s.added,

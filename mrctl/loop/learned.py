@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from mrctl.control.learners import LEARNERS
-from mrctl.control.weights import notes_on, read_arrays, write_arrays
+from mrctl.control.weights import named, notes_on, read_arrays, write_arrays
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import scenarios_of
@@ -57,11 +57,9 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         learner, layout = own["learner"], own["shapes"]
     else:
         learner, layout = scenario.learner, kept(scenario)
-    flat, arrays, start = one.weights.values, {}, 0
-    for name, shape in layout.items():
-        stop = start + int(np.prod(shape))
-        arrays[name], start = flat[start:stop].reshape(shape), stop
-        if not np.isfinite(arrays[name]).all():
+    arrays = named(one.weights.values, layout)
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
             raise InputError(f"learned: {name} of {learner} is not finite, and no run could start from it")
     notes = {"learner": learner, "robot": scenario.robot.path, "prior": scenario.prior}
     write_arrays(path, arrays, notes | {"steering": str(one["steering"].values)})

@@ -454,6 +454,8 @@ class Simulation:
             InputError: The robot could not stand.
             ValueError: The simulation was not made with `restarting`.
         """
+        if not isinstance(self.courses, RestartingCourses):
+            raise ValueError("restart: the simulation was not made with `restarting`")
         plant, tick = self.plant, self.tick
         if scenario.perturbation != self.scenarios[row].perturbation:
             self.events.perturb(row, scenario.perturbation)

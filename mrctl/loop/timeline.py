@@ -30,15 +30,15 @@ def followed(scenario: Scenario, time: float) -> Reference:
 
 
 def begun(scenario: Scenario, time: float) -> float:
-    """Returns since when a run has followed the reference that it follows at a time in s."""
+    """Returns the time in s at which the reference began that a run follows at a time in s."""
     return max((e.time for e in scenario.events if e.reference and e.time <= time + 1e-9), default=0.0)
 
 
 def ends(scenario: Scenario, time: float) -> Array | None:
-    """Returns where the robot of a run comes from and goes to at a time in s; None on a course without end.
+    """Returns start and end of the way that a run follows at a time in s; None where it has no end.
 
-    These are the ends of the open reference that it follows then; a goal of the scenario is in place of the end of its
-    own reference.
+    The end is the goal of the scenario while the run follows the scenario's own reference and there is a goal,
+    otherwise the end of open waypoints.
 
     Returns:
         Two poses, x and y in m and θ in rad, `(2, 3)`.

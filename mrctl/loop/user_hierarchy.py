@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrctl.control.feedforward import Learner
 from mrctl.control.kanayama import Kanayama, posture_error
 from mrctl.control.pid import pid
+from mrctl.control.steering import steer
 from mrctl.kernel import Array, Rows, kernel
-from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
+from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion, watch
 from mrctl.loop.user_stages import UserStage
 from mrctl.scenario import Scenario
 from mrctl.theory.rays import Scan
@@ -46,11 +46,26 @@ def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Row
 
 
 @kernel
-def apply_all(seen: Rows, model: Rows, robot: Rows, period: float, control: Rows) -> tuple[bool, bool]:
+def watch_all(seen: Rows, model: Rows, robot: Rows, period: float, control: Rows) -> None:
+    """Calls `watch` for all robots."""
+    for i in range(len(control)):
+        watch(seen[i], model[0], robot[0], period, control[i])
+
+
+@kernel
+def steer_all(robot: Rows, period: float, control: Rows) -> None:
+    """Calls `steer` for all robots."""
+    for i in range(len(control)):
+        s = control[i]
+        steer(s.limiter.command, s.limiter.derivative, s.feedback, s.guard.output, period, robot[0], s.allocation)
+
+
+@kernel
+def apply_all(seen: Rows, robot: Rows, period: float, control: Rows) -> tuple[bool, bool]:
     """Calls `apply_voltages` for all robots; returns whether all are finite, and whether one asks for `answer`."""
     finite, asks = True, False
     for i in range(len(control)):
-        finite &= apply_voltages(seen[i], model[0], robot[0], period, control[i])
+        finite &= apply_voltages(seen[i], robot[0], period, control[i])
         asks |= control[i].guard.forget | control[i].delay.due
     return finite, asks
 
@@ -117,9 +132,12 @@ class UserHierarchy(Hierarchy):
             self._feed_back(feedback, seen["twist"])
         state["feedforward"] = self.feedforward(self.command, self.derivative)
         self._read_weight_norm()
-        finite, asks = apply_all(seen, self.model.rows, *constants, state)
+        watch_all(seen, self.model.rows, *constants, state)
         if stage := self.stages.get("steering"):
-            self._steer(stage, seen["lost"].any(axis=1))
+            self._steer(stage)
+        else:
+            steer_all(*constants, state)
+        finite, asks = apply_all(seen, *constants, state)
         taught = state["guard"]["teaching"], state["frozen"], seen["twist"], state["voltage"]
         if (added := self.learner.learn(*taught)) is not None:
             state["added"] = self._sound(added)
@@ -137,6 +155,11 @@ class UserHierarchy(Hierarchy):
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the gains of one robot; see `Hierarchy.set_kanayama`. A user's motion controller is told."""
         super().set_kanayama(row, gains)
+        self._tune_motion(row)
+
+    def renew(self, row: int, scenario: Scenario) -> None:
+        """Gives one robot a new scenario; see `Hierarchy.renew`. A user's motion controller is told its gains."""
+        super().renew(row, scenario)
         self._tune_motion(row)
 
     def _tune_motion(self, row: int) -> None:
@@ -201,26 +224,13 @@ class UserHierarchy(Hierarchy):
             self.feedforward_faults[row] = self.feedforward_faults[row] or fault
         return self._finite_rows(stage, np.where(broken[:, None], 0.0, answer))
 
-    def _steer(self, stage: UserStage, lost: NDArray[np.bool]) -> None:
-        """Calls the user's steering, and limits it as `allocate` does; `lost` are the robots with a limited current."""
-        state, limit = self.state, self.robot.steering_limit
-        allocation, command = state["allocation"], self.command.copy()
+    def _steer(self, stage: UserStage) -> None:
+        """Calls the user's steering, whose angle and rate `allocate` limits."""
+        state, command = self.state, self.command.copy()
         if self.rigid:
             command[:, 1] += self.feedback[:, 1] + state["guard"]["output"][:, 1]
         answer = self._finite_rows(stage, stage.output(command, self.derivative))
-        angle = np.clip(answer[:, 0], -limit, limit)
-        beyond = angle != answer[:, 0]
-        rate = np.where(beyond, 0.0, answer[:, 1])
-        self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self.period / 2, -limit, limit), rate
-        if self.rigid:  # the fork makes θ̇, so its limit acts on the second channel
-            clipped = (self.output[:, :2] != allocation["feedback"] + allocation["feedforward"]).any(axis=1)
-            made = command[:, 0] * np.tan(angle) / self.robot.wheelbase
-            allocation["excess"][:, 1] = np.where(beyond, made - command[:, 1], 0.0)
-            allocation["saturated"] = beyond | clipped | lost
-            state["voltage"][:, 1] = command[:, 1] - self.command[:, 1] + allocation["excess"][:, 1]
-            state["frozen"] = np.any(
-                [allocation["saturated"], state["learning_off"], state["guard"]["frozen"], state["slips"]], axis=0
-            )
+        state["allocation"]["angle"], state["allocation"]["rate"] = answer.T
 
     def _read_weight_norm(self) -> None:
         """Reads the norm of the learner's weights, if the feedforward has it."""

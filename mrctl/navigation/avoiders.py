@@ -41,7 +41,9 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
     ) -> Waypoints | None:
         plan = open_waypoints(scenario.reference)
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
-        start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
+        x, y, theta = pose.tolist()
+        here = x, y, remainder(theta, 2 * pi)
+        start = Task.from_dict({"obstacles": scenario.known, "start": here, "goal": goal})
         keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
         try:
             return planned(

@@ -25,7 +25,7 @@ from mrctl.theory.robot import Robot
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
 RIM = 0.02  # m, radius of the discs around the robot, which reach as far beyond its footprint
 KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
-TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
+TRACKED = 0.01  # m, for errors of tracking: by so much the margin from the map is at least below that of the plan
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
 SLOW = 0.1  # mean λ over the time WAITED, below which a robot makes no headway; chosen
 
@@ -104,8 +104,8 @@ class Pacer:
         # The margin from the map is smaller than what the plan has, and negative where the discs overlap the map on it.
         free = least_clearance(footprint, plan, self._planner.sight.map)
         self._kept = self._barrier(min(KEPT, free - RIM - TRACKED))
-        self._clock, self._anchor = 0.0, 0.0  # s in motion periods, now and where the robot last got on
-        self._place = np.inf  # where the plan is blocked, in motion periods
+        self._clock, self._anchor = 0.0, 0.0  # the clock in motion periods: now, and where the robot last made headway
+        self._place = np.inf  # the clock at which the plan is blocked, in motion periods; infinite where it is free
         self._stops = False  # whether the robot stops for a shorter way
         self._planner.blocked = np.inf
 
@@ -140,39 +140,41 @@ class Pacer:
         first = self._first
         return self._plan[first] + min(self._clock - first, 1.0) * (self._plan[first + 1] - self._plan[first])
 
-    def go_on(self, request: Array, pose: Array, now: Array, time: float) -> None:
-        """Slows the plan by as much as the filter asks for, and advances its clock by a motion period.
+    def go_on(self, request: Array, pose: Array, reference: Array, time: float) -> None:
+        """Sets the pace as near to the allowed λ as the robot can follow, and advances the clock of the plan by it.
 
         Args:
             request: Twist that Kanayama's law requests, V in m/s and θ̇ in rad/s, `(2,)`; out: what is allowed of it.
             pose: x and y in m and θ in rad, `(3,)`.
-            now: The `reference`; out: the same at the pace.
+            reference: The plan at its clock, `(7,)`; out: the same at the pace.
             time: Time in s.
         """
-        before, twist = self.pace, now[3:5].copy()
+        before, twist = self.pace, reference[3:5].copy()
         change = self._period * self._robot.max_acceleration / max(abs(float(twist[0])), 1e-9)
         self.pace = min(max(self._share(request, pose, time), before - change), before + BRAKING * change, 1.0)
-        now[3:5] = self.driven = self.pace * twist
-        now[5:] = self.pace * self.pace * now[5:] + (self.pace - before) / self._period * twist
+        reference[3:5] = self.driven = self.pace * twist
+        reference[5:] = self.pace * self.pace * reference[5:] + (self.pace - before) / self._period * twist
         self._clock += self.pace
         request *= self.pace
 
     def _share(self, request: Array, pose: Array, time: float) -> float:
-        """Returns the largest λ that the filter allows at a time in s."""
+        """Returns the largest λ at a time in s that filter, way to where the plan is blocked, and a stop allow."""
         sight, found = self._planner.sight, 0.0 if self._stops else 1.0
         if np.isfinite(self._place):
             part = self._plan[int(self._clock) : int(self._place), 3]
             left = self._period * float(np.abs(part).sum()) - STANDOFF
-            found = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
+            braked = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
+            found = min(found, braked)
         around = (sight.map, self._kept), (sight.standing, self._near), (sight.moving(time), self._away)
         near = [each for each in around if len(each[0].discs) + len(each[0].rings)]
         return min([found, *(share(request, pose, *each) for each in near)])
 
     def replan(self, pose: Array, velocity: float, now: float) -> None:
-        """Takes another plan, if there was a scan by which its own is blocked, or the map lets it have a shorter one.
+        """Takes another plan if its own is blocked, if a changed map allows a shorter one, or if it makes no headway.
 
-        It takes at once a plan that begins at about its own speed. Otherwise it plans again at rest: after a stop for
-        a shorter way, or when something that stands has hardly let it get on for a second.
+        It does so only after a new scan. A plan that begins at about the robot's speed is taken at once. For a shorter
+        one that does not, the robot stops first. It also plans where it has made no headway for `WAITED` beside
+        something that stands.
 
         Args:
             pose: x and y in m and θ in rad, `(3,)`.
@@ -271,7 +273,7 @@ class Pacing:
             pacer.replan(place, float(velocity), self._now)
         self.followed = np.stack([pacer.reference for pacer in self._pacers])
         requests = self._law.output(pose, self.followed)
-        for pacer, request, place, now in zip(self._pacers, requests, pose, self.followed, strict=True):
-            pacer.go_on(request, place, now, self._now)
+        for pacer, request, place, own in zip(self._pacers, requests, pose, self.followed, strict=True):
+            pacer.go_on(request, place, own, self._now)
         self._tick += 1
         return requests

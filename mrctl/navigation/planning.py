@@ -102,7 +102,7 @@ def planned(
     this twist: first the arc on which it drives, for as far as it needs to come to rest, and on from there, so that it
     can drive the plan whatever follows. Where that arc is within the margin of an obstacle, or no way leads on from it,
     the plan begins at the robot, straight and with the largest speed from which the limits can be kept; the robot is
-    off it until it is as slow. So does a plan for a robot that goes along it at its own pace, which it need not keep.
+    off it until it is as slow. A plan for a robot that goes along it at its own pace begins in this way, too.
     A plan for a robot that stands or reverses begins at rest.
 
     Args:

@@ -261,15 +261,15 @@ class Reactive(ABC):
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
-        self.planners = Planner.each(self._replan, scenarios)
-        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self.planners]
+        self._planners = Planner.each(self._replan, scenarios)
+        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self.planners[0].vehicle.footprint, *DISCS), dict[Hashable, Field]()
-        for planner, bounds, start in zip(self.planners, self.bounds, pose, strict=True):
+        discs, fields = cover(self._planners[0].vehicle.footprint, *DISCS), dict[Hashable, Field]()
+        for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:
                 places = planner.first.sample(np.linspace(0, planner.first.period, 200)).pose[:, :2]

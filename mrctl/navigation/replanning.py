@@ -24,7 +24,7 @@ AGAIN = 3.0  # s, after which a search that found no way is repeated in any case
 SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
 SURE = 0.3  # s for which a plan must be blocked by what stands: what moves seems to stand at first; chosen
 WAITED = 1.0  # s without headway, after which a robot makes another plan; chosen
-RETRY = 1.0  # s, least time between two plans; chosen
+RETRY = 1.0  # s, least time between two searches for a way around what blocks a plan; chosen
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
@@ -68,10 +68,12 @@ class Planner:
         sight: What the robot knows of its surroundings.
         vehicle: What its plans need to know of the robot itself.
         looked: Whether a scan came since this was last set to False; a robot that has failed gets none.
-        map_changed: Whether the map has changed since the last plan was tried, so that a shorter way may be free.
-        blocked: Time in s since when its plan leads through what stands beside the map; infinite where it does not.
-        got_on: Time in s at which it last made headway.
-        tried: Time in s at which it last looked for another plan.
+        map_changed: Whether the map has changed since a plan was last looked for, so that a shorter way may be free.
+        blocked: Time in s since when its plan leads through something that stands and is not on the map; infinite where
+            it does not.
+        got_on: Time in s from which its waiting counts: when it last made headway, had no reason to, or looked for
+            another plan because it had waited.
+        tried: Time in s of the last search from which `RETRY` counts; −∞ where the next one need not wait.
     """
 
     def __init__(self, replan: Replan, scenario: Scenario, sight: Sight, vehicle: Vehicle) -> None:
@@ -152,9 +154,9 @@ class Planner:
             The plan, or None where there is no way. A search that finds none takes far longer than one that does. It
             is repeated only after 3 s, or when the robot or an obstacle is elsewhere, and never while `ahead`.
         """
-        self.map_changed = False
         if ahead and self._hopeless:
             return None
+        self.map_changed = False
         near, far = self.sight.outlines(time), self.sight.around(time, self.vehicle.footprint, pose)
         if self._hopeless:
             since, there, known = self._hopeless

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from mrctl.kernel import Array
 from mrctl.record import InputError
 
-FEW = 10  # samples, below which the bootstrap of a mean is too narrow: of four it holds the mean in 80 % of the cases
+FEW = 10  # samples; with fewer the bootstrap of a mean is too narrow: its 95 % interval of four holds it in 80 %
 
 
 class Interval(NamedTuple):
@@ -58,9 +58,10 @@ class Superiority(NamedTuple):
 def bootstrap_interval(
     samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0, *, median: bool = False
 ) -> Interval:
-    """Returns the mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
+    """Returns the mean of the finite samples with its confidence interval.
 
-    Of fewer than ten samples the interval of the mean is Student's, because the bootstrap would be too narrow.
+    It is the bias-corrected, accelerated bootstrap interval (Efron, 1987), or for the mean of fewer than ten samples
+    Student's, because the bootstrap would be too narrow.
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.

@@ -166,7 +166,7 @@ def velocities(
     window: tuple[float, float] | None = None,
     lap: int | None = None,
 ) -> Figure:
-    """Draws linear and yaw rate, or one of them, over time with the original reference (paper's figure 4)."""
+    """Draws linear velocity and yaw rate, or one of them, over time with the original reference (paper's figure 4)."""
     figure, axes = _figure(COLUMN, (0.1 + 0.4 * len(signals)) * COLUMN, rows=len(signals))
     curves = _curves(result, window, lap)
     texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}

@@ -22,7 +22,7 @@ from mrctl.control.guard import guard
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.control.limiter import limit
 from mrctl.control.pid import pid
-from mrctl.control.steering import allocate
+from mrctl.control.steering import allocate, steer
 from mrctl.experiments.tables import markdown, number
 from mrctl.kernel import Kernel, kernel
 from mrctl.loop.simulation import Simulation
@@ -73,7 +73,8 @@ def laws(simulation: Simulation) -> dict[str, tuple[Kernel, tuple[Any, ...]]]:
             (state["guard"], feedforward, state["nominal"], state["error"], command, seen["twist"], voltage, period,
              bool(robot["rigid"]), state["pid"]["integral"], feedback),
         ),
-        "allocation": (allocate, (command, derivative, feedback, feedforward, period, robot, allocation)),
+        "steering": (steer, (command, derivative, feedback, feedforward, period, robot, allocation)),
+        "allocation": (allocate, (command, feedback, feedforward, period, robot, allocation)),
         "feedforward": (stage.respond, (0, command, derivative, robot, arrays, feedforward)),
         "learning": (
             stage.learn_one,

@@ -18,6 +18,8 @@ import pytest
 
 import mrctl
 from mrctl import InputError, cli
+from mrctl.cli.shared import show
+from mrctl.experiments.tables import Report
 from mrctl.sweep import jobs
 from mrctl.sweep.plan import Sweep
 from mrctl.viewer.recording import Library
@@ -346,3 +348,11 @@ def test_full_disk_costs_no_table(
     told = capsys.readouterr()
     assert shown in told.out
     assert told.err.splitlines()[-1] == "mrctl: No space left on device"
+
+
+def test_closed_pipe_costs_no_file() -> None:
+    """What was driven is saved where nobody reads what is printed."""
+    saved = mock.Mock()
+    with mock.patch("builtins.print", side_effect=BrokenPipeError), pytest.raises(BrokenPipeError):
+        show(Report("table", "", saved), None, False)
+    saved.assert_called_once()

@@ -189,6 +189,33 @@ def test_settings_of_a_pid_that_is_not_there():
         simulation.add(event)
 
 
+def test_motion_stage_is_told_its_gains():
+    """A motion stage with `tune` gets the gains at the start, from an event, and again when its robot begins anew."""
+    told = []
+
+    class Rests:
+        def __init__(self, robot, size):
+            pass
+
+        def tune(self, row, gains):
+            told.append((row, gains.k_x))
+
+        def reset(self, pose, reference, period):
+            pass
+
+        def output(self, pose, twist, reference):
+            return np.zeros((len(pose), 2))
+
+    scenarios = [with_events().replace(kanayama=Kanayama(k_x=k_x)) for k_x in (1.0, 2.0)]
+    simulation = Simulation(scenarios, restarting=True, motion=Rests)
+    assert told == [(0, 1.0), (1, 2.0)]
+    simulation.add(Event(time=0.0, kanayama=Kanayama(k_x=7.0)))
+    simulation.step()
+    assert told[2:] == [(0, 7.0), (1, 7.0)]
+    simulation.restart(1, scenarios[1])
+    assert told[4:] == [(1, 2.0)]
+
+
 def test_reference():
     """From the event on the robot is shown the new reference from its own start, and follows it."""
     other = Circle(period=5, radius=0.7, clockwise=True)

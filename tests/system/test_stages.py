@@ -13,7 +13,7 @@ from mrctl.cli import main
 from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.nominal import nominal
 from mrctl.control.pid import PID, pid
-from mrctl.control.steering import ALLOCATION, allocate
+from mrctl.control.steering import ALLOCATION, allocate, steer
 from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop import user_files
@@ -112,7 +112,8 @@ class Fork:
 
     def output(self, command, derivative):
         zero = np.zeros_like(command)
-        over_rows(allocate, command, derivative, zero, zero, self.period, self.robot, self.state)
+        over_rows(steer, command, derivative, zero, zero, self.period, self.robot, self.state)
+        over_rows(allocate, command, zero, zero, self.period, self.robot, self.state)
         return np.stack([self.state["angle"], self.state["rate"]], axis=1)
 
 

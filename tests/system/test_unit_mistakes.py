@@ -13,6 +13,7 @@ from mrctl import cli
 from mrctl.checks import examination
 from mrctl.checks.command import examination as examine
 from mrctl.experiments import mission, single
+from mrctl.experiments.tables import Report
 from mrctl.physics.files import models_folder
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import LIMITS, bounds, mistake
@@ -141,8 +142,8 @@ def test_an_impossible_robot_drives_with_a_warning(
     text, file, examined = (models_folder() / "turtlebot.xml").read_text(), tmp_path / "mine.xml", []
     impossible = examination.impossible
     monkeypatch.setattr(examination, "impossible", lambda model: examined.append(model) or impossible(model))
-    monkeypatch.setattr(single, "run", lambda *_: ("", ""))
-    monkeypatch.setattr(mission, "run", lambda *_: ("", "arrived"))
+    monkeypatch.setattr(single, "run", lambda *_: Report("", "", lambda: None))
+    monkeypatch.setattr(mission, "run", lambda *_: Report("", "arrived", lambda: None))
     for change in ("turtlebot", text, re.sub('mass="[0-9.]+"', 'mass="3e7"', text)):
         file.write_text(change)
         robot = "turtlebot" if change == "turtlebot" else str(file)

@@ -18,7 +18,8 @@ from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.barrier import Barrier, approach, share
 from mrctl.navigation.barrier_filter import Avoiding, avoid, nearest
-from mrctl.navigation.pacing import Following, Pacing
+from mrctl.navigation.pacing import Following, Pacer, Pacing
+from mrctl.navigation.replanning import Planner
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
@@ -248,6 +249,18 @@ def test_paced_plan_is_driven_whole() -> None:
         ticks += 1
         assert ticks < 3 * plan.period / period
     assert ticks > 1.02 * plan.period / period
+
+
+def test_stop_for_a_shorter_way() -> None:
+    """A robot that stops does so also where its plan is blocked far ahead."""
+    plan = Waypoints(points=((0, 0), (4, 0), (8, 0)), closed=False, timing="limits", speed=1.2)
+    scenario = Scenario(reference=plan, prior="model")
+    pacer = Pacer(Planner.each(lambda *_: None, [scenario])[0], mjcf.build()[1], 0.01)
+    request, pose = np.array([1.0, 0.0]), np.zeros(3)
+    pacer._place = 500.0
+    assert pacer._share(request, pose, 0.0) == 1
+    pacer._stops = True
+    assert pacer._share(request, pose, 0.0) == 0
 
 
 def test_wrapped_stage_sees() -> None:

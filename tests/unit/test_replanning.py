@@ -5,6 +5,7 @@ import pytest
 
 from mrctl import Disc, InputError, Obstacles, Scenario
 from mrctl.navigation import hybrid_astar
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.hybrid_astar import NoWay
 from mrctl.navigation.planning import prepared
 from mrctl.navigation.replanning import Planner
@@ -126,3 +127,18 @@ def test_no_way_is_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="never plans in reverse"):
         prepared(task, scenario, avoid="mppi")
     assert tried == [False, False, True]
+
+
+def test_turned_more_than_once() -> None:
+    """A plan from a heading that has counted whole turns is that from the same heading without them."""
+    own = Scenario(prior="model", learner="none")
+    _, drive = prepared(task_of("doorway:3", own), own, avoid="window")
+    made = avoiding("window")
+    assert made is not None
+    stage = made(Vehicle.of(own).robot, 1)
+    stage.assign([drive])
+    (planner,) = stage._planners
+    pose = np.array(drive.initial_pose)
+    plain, turned = (planner.plan(pose + [0, 0, turns * 2 * np.pi], REST, 0.0) for turns in (0, -3))
+    assert plain is not None and turned is not None
+    np.testing.assert_allclose(turned.points, plain.points, atol=1e-9)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.nominal import nominal
-from mrctl.control.steering import ALLOCATION, REST, allocate, take_loss
+from mrctl.control.steering import ALLOCATION, REST, allocate, steer, take_loss
 from mrctl.kernel import over_rows
 from mrctl.theory import kinematics
 from mrctl.theory.dynamics import common_differential, inverse_dynamics, left_right
@@ -34,8 +34,9 @@ class Allocation:
         return self._record[name][0]
 
     def __call__(self, twist, acceleration=ZERO, feedback=ZERO, feedforward=ZERO):
-        motion = (np.asarray(values, float) for values in (twist, acceleration, feedback, feedforward))
-        allocate(*motion, self._period, self._robot, self._record[0])
+        twist, acceleration, *added = (np.asarray(a, float) for a in (twist, acceleration, feedback, feedforward))
+        steer(twist, acceleration, *added, self._period, self._robot, self._record[0])
+        allocate(twist, *added, self._period, self._robot, self._record[0])
         return self.command
 
     @property
@@ -199,7 +200,8 @@ def test_rows(robot, rigid, twist, acceleration, feedback, feedforward, state):
         inputs[0][list(lost)] = inputs[2][list(lost)] = np.nan
         s = np.zeros(len(inputs[0]), ALLOCATION)
         s["angle"], s["rate"] = state[rows].T
-        over_rows(allocate, *inputs, 0.01, nominal(robot, rigid)[0], s)
+        over_rows(steer, *inputs, 0.01, nominal(robot, rigid)[0], s)
+        over_rows(allocate, inputs[0], *inputs[2:], 0.01, nominal(robot, rigid)[0], s)
         return s
 
     together = answer(slice(None), lost=[3])
