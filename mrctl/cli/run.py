@@ -82,9 +82,9 @@ def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json
     announced_early()
     from mrctl.experiments import single
 
-    found = single.repeat(folder, out, json, controller)
+    found, departs = single.repeat(folder, out, json, controller)
     show(found, out, json)
-    expect_same(folder, found.ended, json)
+    expect_same(folder, departs, json)
 
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:

@@ -64,7 +64,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     return _report(scenario, result, out, as_json, own)
 
 
-def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None) -> Report:
+def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None) -> tuple[Report, str]:
     """Runs a saved run again, and compares it with what was saved.
 
     Args:
@@ -74,7 +74,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
         own: The stages of the user that drove it; a result holds only their names.
 
     Returns:
-        The report of `run`; it `ended` with the signal in which the run departs from the saved one, or "".
+        The report of `run`; and in which signal the run departs from the saved one, or "".
 
     Raises:
         InputError: There is no result of one run, other stages drove it, or `run` refuses something.
@@ -91,7 +91,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
             with_them = f"--controller with {names}" if names else "no --controller"
             raise InputError(f"controller: the run in {folder} needs {with_them}, as when it was saved")
         result = _driven(scenarios[0], own)
-    return _report(scenarios[0], result, out, as_json, own)._replace(ended=departure(result, saved))
+    return _report(scenarios[0], result, out, as_json, own), departure(result, saved)
 
 
 def _driven(scenario: Scenario, own: str | None) -> xr.Dataset:

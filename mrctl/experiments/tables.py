@@ -58,8 +58,7 @@ class Report(NamedTuple):
     text: str
     """What was found, as text or JSON."""
     ended: str
-    """Of `navigate` the outcome of the first robot; of `run` when and why it failed, or ""; of a run that was repeated
-    the signal in which it departs from the saved one, or ""."""
+    """Of `navigate` the outcome of the first robot; of `run` when and why it failed, or ""; else ""."""
     save: Callable[[], None]
     """Writes the files; does nothing where the command writes none."""
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.scenario import Event, Scenario
+from mrctl.scenario import Scenario
 from mrctl.theory.references import Reference, Waypoints
 
-# Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
-CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
+# Fields of a scenario that events can change in the middle of a run; a change of another field needs a new run.
+CHANGEABLE = ["perturbation", "kanayama", "pid"]
 
 
 def state(scenario: Scenario, time: float) -> dict[str, Any]:

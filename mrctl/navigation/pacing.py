@@ -57,15 +57,10 @@ def follow_all(pose: Array, reference: Array, gains: Rows, error: Array, request
 
 
 class Pacer:
-    """One robot on a plan in time: its clock, how fast that goes, and when it takes another plan.
-
-    Attributes:
-        pace: λ of the last output.
-        driven: Twist of the plan at its pace, V in m/s and θ̇ in rad/s, `(2,)`.
-    """
+    """One robot on a plan in time: its clock, how fast that goes, and when it takes another plan."""
 
     def __init__(self, planner: Planner, robot: Robot, period: float) -> None:
-        """Takes the robot to its mission; `start` follows.
+        """Starts a run on the plan of the mission.
 
         Args:
             planner: Its mission, and what it knows.
@@ -76,18 +71,14 @@ class Pacer:
         self._brakes = BRAKING * robot.max_acceleration
         self._discs = rim(planner.vehicle.footprint, RIM)
         self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
-        self.reset()
+        self._pace, self._driven = 1.0, np.zeros(2)  # λ, and the twist of the plan at this pace, m/s and rad/s
+        planner.reset()
+        scenario = planner.scenario
+        self._follow(planner.first, scenario.sensing.periods("delay", scenario.control_period))
 
     def _barrier(self, margin: float) -> Barrier:
         """Returns the filter that keeps this clearance in m."""
         return Barrier(self._discs, margin, self._brakes, self._period)
-
-    def reset(self) -> None:
-        """Starts a run."""
-        self._planner.reset()
-        scenario = self._planner.scenario
-        self._follow(self._planner.first, scenario.sensing.periods("delay", scenario.control_period))
-        self.pace, self.driven = 1.0, np.zeros(2)
 
     def _follow(self, plan: Waypoints, delay: int = 0) -> None:
         """Goes along a plan from its beginning.
@@ -116,9 +107,9 @@ class Pacer:
     def _begin(self, plan: Waypoints, now: float) -> None:
         """Drives another plan from now on, a time in s, at the pace at which the robot keeps its speed."""
         self._follow(plan)
-        velocity, first = float(self.driven[0]), float(self._plan[0, 3])
+        velocity, first = float(self._driven[0]), float(self._plan[0, 3])
         if velocity * first > 0:
-            self.pace = min(1.0, velocity / first)
+            self._pace = min(1.0, velocity / first)
         self._planner.got_on, self._planner.tried, self._planner.map_changed = now, -np.inf, False
 
     def see(self, scan: Scan) -> None:
@@ -149,13 +140,13 @@ class Pacer:
             reference: The plan at its clock, `(7,)`; out: the same at the pace.
             time: Time in s.
         """
-        before, twist = self.pace, reference[3:5].copy()
+        before, twist = self._pace, reference[3:5].copy()
         change = self._period * self._robot.max_acceleration / max(abs(float(twist[0])), 1e-9)
-        self.pace = min(max(self._share(request, pose, time), before - change), before + BRAKING * change, 1.0)
-        reference[3:5] = self.driven = self.pace * twist
-        reference[5:] = self.pace * self.pace * reference[5:] + (self.pace - before) / self._period * twist
-        self._clock += self.pace
-        request *= self.pace
+        self._pace = min(max(self._share(request, pose, time), before - change), before + BRAKING * change, 1.0)
+        reference[3:5] = self._driven = self._pace * twist
+        reference[5:] = self._pace * self._pace * reference[5:] + (self._pace - before) / self._period * twist
+        self._clock += self._pace
+        request *= self._pace
 
     def _share(self, request: Array, pose: Array, time: float) -> float:
         """Returns the largest λ at a time in s that filter, way to where the plan is blocked, and a stop allow."""
@@ -188,7 +179,7 @@ class Pacer:
         if self._stops:
             if abs(velocity) < RESTING:
                 self._stops = False
-                if plan := planner.plan(pose, self.driven, now):
+                if plan := planner.plan(pose, self._driven, now):
                     self._begin(plan, now)
             return
         blocked = planner.is_blocked(now)
@@ -196,13 +187,13 @@ class Pacer:
             self._anchor, planner.got_on = self._clock, now
         if now - planner.got_on >= WAITED:
             planner.got_on = planner.tried = now  # where there is no other plan, it tries again later
-            if plan := planner.plan(pose, self.driven, now):
+            if plan := planner.plan(pose, self._driven, now):
                 self._begin(plan, now)
         elif planner.map_changed or (blocked and now - planner.tried >= RETRY):
             left = np.inf if blocked else self._period * (len(self._plan) - self._clock)
             planner.tried = now
-            if plan := planner.plan(pose, self.driven, now, ahead=not planner.map_changed):
-                excess = self.driven[0] - plan.sample(np.zeros(1)).twist[0, 0]
+            if plan := planner.plan(pose, self._driven, now, ahead=not planner.map_changed):
+                excess = self._driven[0] - plan.sample(np.zeros(1)).twist[0, 0]
                 at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
                 if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
                     if at_once:
