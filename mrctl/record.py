@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
-LARGEST = 4 * 2**20  # bytes, largest text file of settings; one of this size takes some seconds to read
+MAX_TEXT_BYTES = 4 * 2**20  # bytes, largest text file of settings; one of this size takes some seconds to read
 WRITTEN_BY = "# written by mrctl "  # how a TOML file begins that `to_toml` made
-GONE = "this field of an earlier version is gone"
+FIELD_GONE = "this field of an earlier version is gone"
 
 
 class InputError(ValueError):
@@ -49,7 +49,7 @@ def reading(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: damaged or missing: {text[:300]}") from None
 
 
-def read_file(path: str | Path, largest: int = LARGEST) -> bytes:
+def read_file(path: str | Path, largest: int = MAX_TEXT_BYTES) -> bytes:
     """Reads a regular file of limited size, so that no pipe, device or huge file blocks the program.
 
     Args:
@@ -141,7 +141,7 @@ class Record(BaseModel, metaclass=_Constructors):
     @classmethod
     def _knows_moved_fields(cls, values: Any) -> Any:  # noqa: ANN401
         for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
-            raise ValueError(f"{name}: {GONE}; {cls.moved[name]}")
+            raise ValueError(f"{name}: {FIELD_GONE}; {cls.moved[name]}")
         return values
 
     @classmethod
@@ -157,7 +157,7 @@ class Record(BaseModel, metaclass=_Constructors):
         try:
             cls.from_dict(values)
         except InputError as error:
-            if GONE in str(error):
+            if FIELD_GONE in str(error):
                 raise
 
     def replace(self, **changes: Any) -> Self:  # noqa: ANN401

@@ -50,7 +50,7 @@ COMPARED: tuple[FeedforwardName, ...] = tuple(
     name for name, pair in FEEDFORWARDS.items() if pair["prior"] != "none" or name in ("none", "fel")
 )
 """Feedforwards that the tables compare: all with a prior and, without one, PID alone and the paper's network."""
-LONGEST = 10_000_000
+MAX_TICKS = 10_000_000
 """Largest number of control periods in a run; the log takes 488 bytes for each."""
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
@@ -186,8 +186,8 @@ class Scenario(Record):
             _check_multiple(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
         if self.learner in MODEL_BASED and self.prior == "none":
             raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set prior to model")
-        if not 1 <= self.duration / self.control_period <= LONGEST:
-            raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
+        if not 1 <= self.duration / self.control_period <= MAX_TICKS:
+            raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {MAX_TICKS:,} control periods")
         self.sensing.check(self.control_period, self.duration)
         return self
 

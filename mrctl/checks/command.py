@@ -21,7 +21,7 @@ from mrctl.physics.elements import has
 from mrctl.physics.files import SHIPPED, world_path
 from mrctl.physics.mjcf import arrangement, load, load_robot, steerings
 
-SECONDS = 28.0  # s by the clock for loading, all checks and explanations; those that are left then fail
+MAX_SECONDS = 28.0  # s by the clock for loading, all checks and explanations; those that are left then fail
 UNEXPLAINED = "no inspection explains this, nor does a shorter time step"
 
 
@@ -79,7 +79,7 @@ def run(
     Raises:
         InputError: The robot cannot be loaded.
     """
-    with ending(SECONDS):
+    with ending(MAX_SECONDS):
         robot = examination(path, wheels, steering, chassis)
         findings = [robot.examine(check) for check in tqdm(robot.checks, unit="check")]
     failed = sum(finding.status == "failed" for finding in findings)

@@ -10,8 +10,8 @@ import numpy as np
 
 from mrctl.checks.comparison import Report, compare
 from mrctl.checks.open_loop import (
-    HOLD,
-    OFF,
+    HOLD_TIME,
+    NO_CONTROL,
     Car,
     braking,
     crisp,
@@ -44,7 +44,9 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
     force, weight = holding_force(robot), robot.mass * GRAVITY
     steepest = _steepest(robot)
     slopes = [Perturbation(slope=-float(np.arcsin(ratio * force / weight))) for ratio in (0.5, steepest)]
-    standing, rolling = (Car(perturbed(model, slope)).drive(settling_time(robot), OFF)["v"][-1] for slope in slopes)
+    standing, rolling = (
+        Car(perturbed(model, slope)).drive(settling_time(robot), NO_CONTROL)["v"][-1] for slope in slopes
+    )
     terminal = (steepest - 1) * force / braking(robot)
     tolerance = 2.5e-3 * steepest * force / braking(robot)
     return [
@@ -125,7 +127,7 @@ def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     step = robot.supply / 24
     tau = robot.velocity_time_constant
     car, _ = cruise(crisp(model, robot, tau), robot, volts)
-    log = car.drive(settling_time(robot), (volts + step, volts + step, 0, 0), min(HOLD, tau / 10))
+    log = car.drive(settling_time(robot), (volts + step, volts + step, 0, 0), min(HOLD_TIME, tau / 10))
     gain = (log["v"][-1] - log["v"][0]) / step
     return [
         compare("gain of V", gain, robot.velocity_gain, "m/s/V", relative=5e-3),
@@ -148,7 +150,7 @@ def rotation_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     damping = 2 * arm**2 * robot.motor_gain * robot.back_emf + robot.mass * robot.com_offset * v
     tau = skid.effective_inertia / damping
     car, _ = cruise(on_skid(crisp(model, robot, tau)), robot, common)
-    log = car.drive(settling_time(robot), (common - step, common + step, 0, 0), min(HOLD, tau / 10))
+    log = car.drive(settling_time(robot), (common - step, common + step, 0, 0), min(HOLD_TIME, tau / 10))
     gain = (log["omega"][-1] - log["omega"][0]) / step
     return [
         compare("gain of θ̇", gain, 2 * arm * robot.motor_gain / damping, "rad/s/V", relative=1e-2),
@@ -163,7 +165,7 @@ def coast_down(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     deceleration = holding_force(robot) / robot.effective_mass
     speed = robot.max_speed
-    log = Car(open_circuit(model), twist=(speed, 0)).drive(0.8 * speed / deceleration, OFF)
+    log = Car(open_circuit(model), twist=(speed, 0)).drive(0.8 * speed / deceleration, NO_CONTROL)
     moving = log.time > 0.1  # the tyres take up their load
     slope, start = np.polyfit(log.time[moving], log["v"][moving], 1)
     bend = np.abs(log["v"] - start - slope * log.time)[moving].max()

@@ -43,8 +43,8 @@ PREREQUISITES = {
     "turning_limits": ("units", "stance"),
 }  # fmt: skip
 PREREQUISITES_OF_OTHERS = ("units", "stance", "limits", "inertias")
-SECONDS = 20.0  # s of processor time for all checks and explanations of a robot; the default robot takes 4
-SECONDS_OF_ONE = 5.0  # s of processor time for one run of a check
+MAX_SECONDS = 20.0  # s of processor time for all checks and explanations of a robot; the default robot takes 4
+MAX_SECONDS_OF_ONE = 5.0  # s of processor time for one run of a check
 STEP_DIVISOR = 8  # by which the time step is divided where no repair explains a failure
 
 
@@ -104,7 +104,7 @@ class Examination:
         """
         self._load = load
         self.suspects = suspects(load(None))
-        self._left = SECONDS
+        self._left = MAX_SECONDS
         self._findings: dict[str, Finding] = {}
 
     def examine(self, check: Check) -> Finding:
@@ -133,7 +133,7 @@ class Examination:
         """Measures the values of a check within the time that is left."""
         start = time.process_time()
         try:
-            with limited(min(SECONDS_OF_ONE, self._left)):
+            with limited(min(MAX_SECONDS_OF_ONE, self._left)):
                 return check.measure(model, read_robot(model))
         finally:
             self._left -= time.process_time() - start

@@ -28,7 +28,7 @@ from mrctl.theory.robot import GRAVITY, Robot
 Part = Any  # the name of an element of a model, or its index
 Assignment = tuple[NDArray, ArrayLike]  # a view of a field of a model, and the value that repairs it
 
-EDGED = (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX)
+EDGED_GEOMS = (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX)
 CONDIM = {1: "has no friction", 4: "also resists spinning", 6: "also resists rolling, which frictionloss does already"}
 
 
@@ -90,7 +90,7 @@ def _edges(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
         box = (0, 0, 0, radius, radius, radius)
         return [(geom.type, mujoco.mjtGeom.mjGEOM_SPHERE), (geom.rbound, radius), (m.geom_aabb[geom.id], box)]
 
-    edged = [wheel for wheel in rolling_wheels(model) if int(model.geom(wheel).type[0]) in EDGED]
+    edged = [wheel for wheel in rolling_wheels(model) if int(model.geom(wheel).type[0]) in EDGED_GEOMS]
     odd = {wheel: f"{wheel} touches the ground along an edge, which scrubs as it turns" for wheel in edged}
     advice = "use a sphere or an ellipsoid for contact, and a cylinder for looks only"
     return _suspect("cylinder scrub", odd, advice, sphere)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mrctl.checks.comparison import Report, compare
-from mrctl.checks.open_loop import HOLD, Car, is_steered, loss_voltage, rolling_wheels, with_finer_step
+from mrctl.checks.open_loop import HOLD_TIME, Car, is_steered, loss_voltage, rolling_wheels, with_finer_step
 from mrctl.physics.mjcf import clone
 from mrctl.theory.robot import GRAVITY, Robot
 
@@ -54,7 +54,7 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
     rear = robot.drive_loss + robot.rolling_force * (1 - robot.front_load) / 2 * robot.wheel_radius
     front = robot.rolling_force * robot.front_load * robot.front_wheel_radius
     coulomb = np.array([rear, rear, *([front / max(1, len(dofs) - 2)] * (len(dofs) - 2))])
-    h, substeps = model.opt.timestep, max(1, round(HOLD / model.opt.timestep))
+    h, substeps = model.opt.timestep, max(1, round(HOLD_TIME / model.opt.timestep))
     before = data.energy.sum()
     supplied = balance = 0.0
     for k in range(round(seconds / (h * substeps))):

@@ -36,11 +36,15 @@ COMPONENTS = {
     "wheel_rate_left": ("wheel_rates", 0), "wheel_rate_right": ("wheel_rates", 1),
 }  # fmt: skip
 """Signals that are components of a field of `READING`."""
-OFF = (0.0, 0.0, 0.0, 0.0)  # no voltage, which shorts the motors, and wheels straight on
-HOLD = 0.02  # s for which a control is held
-LONGEST = 600.0  # s, longest drive; the slowest robot that comes with mrctl needs 20
-MOST = 1_000_000  # steps in a drive
-DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+NO_CONTROL = (0.0, 0.0, 0.0, 0.0)  # no voltage, which shorts the motors, and wheels straight on
+HOLD_TIME = 0.02  # s for which a control is held
+MAX_TIME = 600.0  # s, longest drive; the slowest robot that comes with mrctl needs 20
+MAX_STEPS = 1_000_000  # steps in a drive
+DIVERGENCE_WARNINGS = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 
 
 class Unstable(Exception):
@@ -124,14 +128,14 @@ class Car:
         """Sets voltages left and right in V, steering angle in rad and rate in rad/s, `(4,)`."""
         self.data.ctrl[self._inputs] = np.asarray(control)[: len(self._inputs)]
 
-    def drive(self, seconds: float, control: ArrayLike | Control, hold: float = HOLD) -> Log:
+    def drive(self, seconds: float, control: ArrayLike | Control, hold: float = HOLD_TIME) -> Log:
         """Drives with a constant control, or with a function of the time since the call that is held for `hold` s.
 
         Raises:
             Unstable: The simulation has diverged.
-            TooLong: The drive would last longer than `LONGEST` or take more than `MOST` steps, or the time is up.
+            TooLong: The drive would last longer than `MAX_TIME` or take more than `MAX_STEPS` steps, or the time is up.
         """
-        if not (0 <= seconds <= LONGEST and seconds <= MOST * self.model.opt.timestep):
+        if not (0 <= seconds <= MAX_TIME and seconds <= MAX_STEPS * self.model.opt.timestep):
             step = self.model.opt.timestep
             raise TooLong(f"it would drive for {seconds:.3g} s in steps of {step:.3g} s; look for a wrong unit")
         law = control if callable(control) else lambda _: control
@@ -157,7 +161,7 @@ class Car:
         Raises:
             Unstable: The simulation has diverged.
         """
-        if any(self.data.warning[w].number for w in DIVERGED) or not np.isfinite(self.data.qvel).all():
+        if any(self.data.warning[w].number for w in DIVERGENCE_WARNINGS) or not np.isfinite(self.data.qvel).all():
             raise Unstable
 
     def tyre_forces(self) -> Array:

@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 
 from mrctl.checks.comparison import Report, between, compare
-from mrctl.checks.open_loop import HOLD, OFF, Car, Log, caster_gaps, on_skid, rolling_wheels
+from mrctl.checks.open_loop import HOLD_TIME, NO_CONTROL, Car, Log, caster_gaps, on_skid, rolling_wheels
 from mrctl.physics.elements import MOTORS, REAR, part
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import GYRATION, bounds, extent
+from mrctl.physics.units import GYRATION_RATIOS, bounds, extent
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import Robot
 
@@ -34,7 +34,7 @@ def stance(model: mujoco.MjModel, robot: Robot) -> Report:
     mrctl makes reach the floor, may be off it by what tilts the robot by as much.
     """
     car = Car(model)
-    car.drive(1.0, OFF)
+    car.drive(1.0, NO_CONTROL)
     frame = car.data.body("chassis").xmat.reshape(3, 3)
     nose, side = np.degrees(np.arcsin(frame[2, :2]))
     return [
@@ -64,7 +64,7 @@ def _to_its_limit(
         limit: Final value of V or θ̇ in m/s or rad/s.
         rate: Its rate in m/s² or rad/s².
     """
-    hold = min(HOLD, limit / rate / 50)
+    hold = min(HOLD_TIME, limit / rate / 50)
     unit = np.array(direction)
 
     def law(t: float) -> tuple[float, ...]:
@@ -121,4 +121,4 @@ def inertias(model: mujoco.MjModel, robot: Robot) -> Report:
         spin = body.inertia.max()  # a disc's own axis
         report.append(between(f"inertia of {name} over m r²", spin / (body.mass[0] * radius**2), 0.01, 1))
     gyration = np.sqrt(robot.yaw_inertia / robot.mass)
-    return report + [between("radius of gyration over the size", gyration / robot.size, *GYRATION)]
+    return report + [between("radius of gyration over the size", gyration / robot.size, *GYRATION_RATIOS)]

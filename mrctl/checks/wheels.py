@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mrctl.checks.comparison import Report, compare
-from mrctl.checks.open_loop import HOLD, OFF, Car, crisp, loss_voltage, perturbed, settling_time
+from mrctl.checks.open_loop import HOLD_TIME, NO_CONTROL, Car, crisp, loss_voltage, perturbed, settling_time
 from mrctl.physics.elements import fronts
 from mrctl.theory.kinematics import scrub_free_angle, twist_from_front_wheel, wheel_rates
 from mrctl.theory.perturbation import Perturbation
@@ -25,8 +25,8 @@ def rest(model: mujoco.MjModel, robot: Robot) -> Report:
     remain.
     """
     car = Car(model)
-    car.drive(2.0, OFF)
-    log = car.drive(3.0, OFF)
+    car.drive(2.0, NO_CONTROL)
+    log = car.drive(3.0, NO_CONTROL)
     loads = car.tyre_forces()[:, 2]
     weight = robot.mass * GRAVITY
     rear = (1 - robot.front_load) / 2 * weight
@@ -85,7 +85,7 @@ def rolling(model: mujoco.MjModel, robot: Robot) -> Report:
     volts, w = robot.supply / 4, 2 * np.pi / 2.0
 
     def law(t: float) -> tuple[float, ...]:
-        middle = t + HOLD / 2
+        middle = t + HOLD_TIME / 2
         return _electronic_differential(robot, volts, 0.35 * np.sin(w * middle), 0.35 * w * np.cos(w * middle))
 
     car = Car(model)
@@ -132,7 +132,7 @@ def spinning_wheels(model: mujoco.MjModel, robot: Robot, friction: float, x: flo
     expected = (friction * robot.mass * GRAVITY * (1 - front) - front * robot.rolling_force) / inert
     seconds = min(0.8, 0.5 * robot.velocity_gain * robot.supply / expected)  # faster, the wheels would catch up
     car = Car(crisp(model, robot, robot.velocity_time_constant), pose=(x, 0, 0))
-    log = car.drive(seconds, (robot.supply, robot.supply, 0, 0), min(HOLD, seconds / 40))
+    log = car.drive(seconds, (robot.supply, robot.supply, 0, 0), min(HOLD_TIME, seconds / 40))
     steady = log.time > seconds / 4  # the wheels have reached their speed
     acceleration = np.polyfit(log.time[steady], log["v"][steady], 1)[0]
     slip = ((log["wheel_rate_left"] + log["wheel_rate_right"]) / 2 * robot.wheel_radius - log["v"])[steady].min()

@@ -10,7 +10,7 @@ import numpy as np
 
 from mrctl.checks.comparison import Report, compare
 from mrctl.checks.invariants import winding
-from mrctl.checks.open_loop import OFF, Car, holding_force, loss_voltage, open_circuit, perturbed
+from mrctl.checks.open_loop import NO_CONTROL, Car, holding_force, loss_voltage, open_circuit, perturbed
 from mrctl.checks.wheels import spinning_wheels
 from mrctl.physics.mjcf import clone
 from mrctl.theory.perturbation import Perturbation
@@ -24,7 +24,7 @@ def slope(model: mujoco.MjModel, robot: Robot) -> Report:
     the slope.
     """
     expected = (robot.mass * GRAVITY * np.sin(np.radians(10)) - holding_force(robot)) / robot.effective_mass
-    log = Car(open_circuit(model)).drive(1.0, OFF)
+    log = Car(open_circuit(model)).drive(1.0, NO_CONTROL)
     moving = log.time > 0.2
     measured = -np.polyfit(log.time[moving], log["v"][moving], 1)[0]
     return [compare("acceleration downhill", measured, expected, "m/s²", relative=3e-3)]

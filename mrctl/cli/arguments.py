@@ -21,18 +21,18 @@ NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 WITH_RECORDS = "run", "navigate", "identify", "view"
 """Commands whose short help leaves out most of the flags of a record."""
 
-SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
+SHORT_FLAGS = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
 """Flags that stand for longer ones."""
 
-POSES = "--goal", "--start", "--initial-pose"
+POSE_FLAGS = "--goal", "--start", "--initial-pose"
 """Flags whose values may be written as x,y,θ."""
 
 
 def expanded(arguments: list[str]) -> list[str]:
     """Expands short flags into full ones.
 
-    `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT` the
-    longer one, and a pose x,y,θ three numbers.
+    `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT_FLAGS`
+    the longer one, and a pose x,y,θ three numbers.
 
     Raises:
         InputError: There is no perturbation of that name, a short flag has no value, or a pose has not three numbers.
@@ -49,14 +49,14 @@ def expanded(arguments: list[str]) -> list[str]:
             perturbation = Perturbation.from_dict(name, "perturbation")
             for field, changed in perturbation.model_dump(exclude_defaults=True).items():
                 found += [f"--perturbation.{field.replace('_', '-')}", str(changed)]
-        elif flag in SHORT:
+        elif flag in SHORT_FLAGS:
             if not (name := value if given else next(rest, "")) or name.startswith("--"):
                 raise InputError(f"{flag.removeprefix('--')}: needs a value; see mrctl {arguments[0]} --help")
-            found += [SHORT[flag], name]
-        elif given and flag in POSES:
+            found += [SHORT_FLAGS[flag], name]
+        elif given and flag in POSE_FLAGS:
             found += [flag, *_pose(flag, value)]
         else:
-            in_pose = "," in argument and found[-1:] and found[-1] in POSES
+            in_pose = "," in argument and found[-1:] and found[-1] in POSE_FLAGS
             found += _pose(found[-1], argument) if in_pose else [argument]
     return found
 

@@ -14,10 +14,10 @@ from mrctl.cli.arguments import FROM_FILES, NOT_OF_MISSIONS, WITH_RECORDS
 from mrctl.record import Record
 from mrctl.scenario import Scenario
 
-FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "seed")
+EXPLAINED_FIELDS = ("name", "world", "steering", "reference", "laps", "prior", "learner", "seed")
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
-IDENTIFIED = ("perturbation", "robot", "sensing")
+LISTED_RECORDS = ("perturbation", "robot", "sensing")
 """Arguments of `mrctl identify` that are records; its short help lists them, as that of `run` does with its fields."""
 
 
@@ -32,7 +32,7 @@ def is_short_help(arguments: Sequence[str]) -> bool:
 def explained(arguments: Sequence[str]) -> Sequence[str]:
     """Returns the fields of a scenario to explain: some for --help, all with flags for --help-all, else none."""
     if is_short_help(arguments):
-        return FIRST
+        return EXPLAINED_FIELDS
     asked = {"--help", "--help-all", "-h"} & set(arguments)
     return [name for name in Scenario.model_fields if name not in FROM_FILES] if asked else ()
 
@@ -61,10 +61,10 @@ def with_fields(command: Callable[..., None], default: Scenario, names: Sequence
 def further_flags(command: str) -> str:
     """Lists and explains the fields, or groups of fields, whose flags the short help of a command leaves out."""
     if command == "identify":
-        left_out = list(IDENTIFIED)
+        left_out = list(LISTED_RECORDS)
     else:
         never = NOT_OF_MISSIONS if command == "navigate" else FROM_FILES
-        left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
+        left_out = [name for name in Scenario.model_fields if name not in (*EXPLAINED_FIELDS, *never)]
     # Perturbations are what people change most.
     names = sorted(left_out, key=lambda name: name != "perturbation")
     lines = [f"Further flags, which `mrctl {command} --help-all` explains one by one:"]

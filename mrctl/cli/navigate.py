@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from mrctl.cli.arguments import NOT_OF_MISSIONS, fields_set
-from mrctl.cli.flags import FIRST, is_short_help, partial_record
+from mrctl.cli.flags import EXPLAINED_FIELDS, is_short_help, partial_record
 from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, show, warn_if_impossible
 from mrctl.record import InputError, Record
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
@@ -17,7 +17,7 @@ from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
 def navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out the same fields as that of `run`."""
-    names = FIRST if is_short_help(arguments) else Scenario.model_fields
+    names = EXPLAINED_FIELDS if is_short_help(arguments) else Scenario.model_fields
     default = Scenario() if {"prior", "learner"} & fields_set(arguments) else Scenario(**FEEDFORWARDS[BEST])
     part = partial_record(default, [name for name in names if name not in NOT_OF_MISSIONS])
 

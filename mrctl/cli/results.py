@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from mrctl.cli.arguments import check_switches, fields_set, scenario_file_of
-from mrctl.cli.flags import FIRST, explained, with_fields
+from mrctl.cli.flags import EXPLAINED_FIELDS, explained, with_fields
 from mrctl.cli.shared import BEST, check_exists, check_world, suited
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
@@ -77,7 +77,7 @@ def view_with(arguments: list[str]) -> Callable[..., None]:
         scenario = suited(scenario, arguments, scenario_file)
         viewing.live(scenario, compare if chosen else ("none",), export, host, port)
 
-    return with_fields(view, default, explained(arguments) if asked else FIRST)
+    return with_fields(view, default, explained(arguments) if asked else EXPLAINED_FIELDS)
 
 
 def record(

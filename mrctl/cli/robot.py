@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from mrctl.cli.flags import IDENTIFIED, is_short_help
+from mrctl.cli.flags import LISTED_RECORDS, is_short_help
 from mrctl.cli.shared import Incomplete, check_world, show
 from mrctl.record import InputError, Record
 from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
@@ -89,7 +89,7 @@ def identify_with(arguments: list[str]) -> Callable[..., None]:
         print(identification.run(world, robot, perturbation, sensing, seed, json))
 
     if is_short_help(arguments):
-        for name in IDENTIFIED:
+        for name in LISTED_RECORDS:
             identify.__annotations__[name] = Annotated[Record, tyro.conf.Suppress]
     return identify
 

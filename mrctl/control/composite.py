@@ -35,9 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import CHANNELS, FEATURES, SLOW, feature_scale, features, symmetric_product
+from mrctl.control.features import CHANNELS, FEATURES, STICTION_SPEED, feature_scale, features, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, explained
-from mrctl.control.matching import SETTLED, histories, low_pass, note_sent, recall
+from mrctl.control.matching import SETTLING_TIMES, histories, low_pass, note_sent, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -45,14 +45,15 @@ from mrctl.theory.robot import Robot
 
 REGRESSORS = FEATURES + 2  # the eight of the inverse dynamics, and gravity on a slope
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt; it is smaller, since the geometry needs no motor
-OUTLIER = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
-BRIEF, LASTING = 0.25, 4.0  # s over which squared innovations are averaged, to detect a change of the plant
-CHANGE = 5.0  # ratio of the brief to the lasting mean square of the innovations that shows a changed plant
-NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain no feedback
+OUTLIER_SIGMAS = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
+# s over which squared innovations are averaged, to detect a change of the plant
+BRIEF_AVERAGE, LASTING_AVERAGE = 0.25, 4.0
+CHANGE_RATIO = 5.0  # ratio of the brief to the lasting mean square of the innovations that shows a changed plant
+UNEXCITED = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain no feedback
 # V of noise in a sample for each m/s of noise in the measured wheel speed; tuned with noise of 10 mm/s in V and
 # 20 mrad/s in θ̇, behind filters of 0.03 s, at a control period of 10 ms.
-SCATTER = 300.0
-UNKNOWN = 6.0  # V, standard deviation of the weights of the eight features without a model
+SCATTER_GAIN = 300.0
+UNKNOWN_WEIGHT = 6.0  # V, standard deviation of the weights of the eight features without a model
 
 
 @kernel
@@ -92,7 +93,7 @@ def predict(k: int, s: Row) -> None:
     for i in range(REGRESSORS + 1):
         S += s.phi[i] * Pphi[i]
         e -= s.phi[i] * a[i]
-    e = max(-OUTLIER * np.sqrt(S), min(OUTLIER * np.sqrt(S), e))
+    e = max(-OUTLIER_SIGMAS * np.sqrt(S), min(OUTLIER_SIGMAS * np.sqrt(S), e))
     s.power[k, 0] += s.brief * (e * e - s.power[k, 0])
     s.power[k, 1] += s.lasting * (e * e - s.power[k, 1])
     e /= S
@@ -120,7 +121,7 @@ def track(k: int, feedback: float, s: Row) -> None:
     power = 0.0
     for i in range(REGRESSORS):
         power += phi[i] * Pphi[i]
-    if power > NOTHING:
+    if power > UNEXCITED:
         for i in range(REGRESSORS):
             a[i] += s.step[k] / power * feedback * Pphi[i]
 
@@ -143,9 +144,9 @@ def reset_covariance(k: int, s: Row) -> None:
 @kernel
 def detect_change(period: float, s: Row) -> None:
     """Resets the covariance where the plant has changed, and again when the filters have forgotten the former plant."""
-    settled, before = SETTLED * period * (1 / s.filter - 1), s.since
+    settled, before = SETTLING_TIMES * period * (1 / s.filter - 1), s.since
     s.since += period
-    if s.power[0, 0] > CHANGE * s.power[0, 1] or s.power[1, 0] > CHANGE * s.power[1, 1]:
+    if s.power[0, 0] > CHANGE_RATIO * s.power[0, 1] or s.power[1, 0] > CHANGE_RATIO * s.power[1, 1]:
         for k in range(CHANNELS):
             s.power[k, 1] = max(s.power[k, 0], s.power[k, 1])
         before = s.since = 0.0
@@ -223,8 +224,8 @@ def learn(
     filter_motion(command, twist, voltage, period, robot, s)
     added[0] = added[1] = 0.0
     motion = s.twice
-    moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > SLOW
-    if moves and s.age > SETTLED and frozen == 0:
+    moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > STICTION_SPEED
+    if moves and s.age > SETTLING_TIMES and frozen == 0:
         regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
         explained(motion.twist, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
@@ -270,7 +271,7 @@ class Composite(Record):
     """Feedback in V below which the tracking term is zero; on a steering channel, a tenth of this number in rad/s."""
 
 
-MOTION = np.dtype(
+FILTERED = np.dtype(
     [
         ("voltage", "f8", CHANNELS),  # of the two channels, V (rad/s on a steering channel)
         ("twist", "f8", CHANNELS),  # measured, m/s and rad/s
@@ -294,9 +295,9 @@ COMPOSITE = np.dtype(
         # Motion
         ("age", "f8"),  # time since the start over T + h, with the time constant T of a filter and the period h
         ("heading", "f8"),  # by dead reckoning, rad
-        ("now", MOTION),  # input of the first filter
-        ("once", MOTION),  # output of the first filter
-        ("twice", MOTION),  # output of the second filter
+        ("now", FILTERED),  # input of the first filter
+        ("once", FILTERED),  # output of the first filter
+        ("twice", FILTERED),  # output of the second filter
         ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
         ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
         ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
@@ -340,7 +341,7 @@ def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> A
     P[:, :REGRESSORS, :REGRESSORS] = settings.gain**2 * c[:, :, None] * c[:, None, :]
     P[:, range(REGRESSORS), range(REGRESSORS)] += (settings.spread * unit[:, None]) ** 2
     if not prior:  # the geometry of a steering channel is known in any case
-        P[: 1 if rigid else 2, range(FEATURES), range(FEATURES)] += UNKNOWN**2
+        P[: 1 if rigid else 2, range(FEATURES), range(FEATURES)] += UNKNOWN_WEIGHT**2
     P[:, REGRESSORS, REGRESSORS] = (settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])) ** 2
     return P
 
@@ -367,8 +368,8 @@ class CompositeAdaptation(Learner):
             row["step"] = s.step * np.array([1.0, STEERING_SHARE if rigid else 1.0])
             row["dead_zone"] = s.dead_zone * unit
             row["noise"] = s.noise * unit
-            row["scatter"] = SCATTER * unit * (1.0, robot.half_track)
-            row["brief"], row["lasting"] = period / (period + BRIEF), period / (period + LASTING)
+            row["scatter"] = SCATTER_GAIN * unit * (1.0, robot.half_track)
+            row["brief"], row["lasting"] = period / (period + BRIEF_AVERAGE), period / (period + LASTING_AVERAGE)
             row["filter"] = period / (period + s.filter)
         self.arrays = rows, feature_scale(robot), histories(len(settings), loop.delay, REGRESSORS + 1)
         self.restore(np.arange(len(settings)))
@@ -394,4 +395,4 @@ class CompositeAdaptation(Learner):
             s = self.rows[i]
             s["a"], s["norm"], s["P"], s["tick"] = 0.0, 0.0, s["stationary"], 0
             s["power"] = (s["noise"] ** 2 + s["scatter"] ** 2 * s["variance"])[:, None]
-            s["since"] = SETTLED * self.period * (1 / s["filter"] - 1)
+            s["since"] = SETTLING_TIMES * self.period * (1 / s["filter"] - 1)

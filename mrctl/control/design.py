@@ -28,14 +28,14 @@ from mrctl.theory.robot import Robot
 
 M_S, M_T = 1.6, 1.1
 """Largest |S| and |T|: 1.2 to 2 and 1 to 1.5 are usual (Åström and Hägglund, Advanced PID Control, 2006, ch. 4)."""
-SPEEDS = 0.5, 0.2, 1.0
+SPEED_SHARES = 0.5, 0.2, 1.0
 """Shares of the robot's largest speed at which its loops keep the bounds, *chosen*; `mrctl tune` uses the first one."""
-WHOLE = 1.15
+MOTION_PEAK_FACTOR = 1.15
 """Largest |S| under the motion controller over the larger one of `M_S` and that of the PID alone, *chosen* in random
 worlds: 1.1 makes the position error of PID alone 8 % larger in `field`; 1.2 does not change the gains of `lab`."""
 DAMPING = 0.5
 """Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
-ERROR = 0.05
+CORRECTED_ERROR = 0.05
 """Longitudinal or lateral error in m whose correction stays within the robot's limits on acceleration, *chosen*."""
 PUBLISHED_K_X, PUBLISHED_K_THETA = 10.0, 16.0
 """Gains K_x in 1/s and K_θ in 1/m of Kanayama et al. (1990); upper bounds of the designed ones."""
@@ -44,16 +44,16 @@ PUBLISHED_K_X, PUBLISHED_K_THETA = 10.0, 16.0
 def points(robot: Robot, rigid: bool, channel: int) -> list[tuple[float, Linear]]:
     """Returns the speeds in m/s at which a channel is designed, and its plant at each.
 
-    They are `SPEEDS`, or only the first in the common channel, where the speed does not matter. The yaw of a robot with
-    its centre of mass behind the axle is unstable above some speed. Speeds at which it is unstable are left out; if
-    none is left, the slowest has the plant at rest.
+    They are `SPEED_SHARES`, or only the first in the common channel, where the speed does not matter. The yaw of a
+    robot with its centre of mass behind the axle is unstable above some speed. Speeds at which it is unstable are left
+    out; if none is left, the slowest has the plant at rest.
 
     Args:
         robot: The nominal robot in its steering arrangement.
         rigid: Whether the second channel is steering.
         channel: 0 for the common channel, 1 for the second.
     """
-    speeds = [share * robot.max_speed for share in SPEEDS]
+    speeds = [share * robot.max_speed for share in SPEED_SHARES]
     if channel == 0:
         return [(speeds[0], linear.common(robot))]
     if rigid:
@@ -170,13 +170,14 @@ def motion(
     - The damping ratio ζ is at least `DAMPING` up to the largest speed. K_θ makes the lateral error critically damped
       where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is p³ + (p + κ)² = 0; its root r e^(jψ) with
       cos ψ = −ζ has √r = −sin ψ/cos(3ψ/2) and κ = r^(3/2) sin(3ψ/2) − r cos ψ.
-    - An error e = `ERROR` does not request more than the limits on acceleration, because a rate limit in the loop makes
-      it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops have the time constants 1/K_x and
-      1/(v √K_y).
+    - An error e = `CORRECTED_ERROR` does not request more than the limits on acceleration, because a rate limit in the
+      loop makes it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops have the time constants 1/K_x
+      and 1/(v √K_y).
     - They are at most those of Kanayama et al. (1990).
-    - max |S| of the channel is at most `WHOLE` · max(M_s, max |S| of the PID alone), for this K_x or √K_y and for
-      smaller ones, with and without the model as feedforward (`sensitivity`). The motion controller makes the command
-      follow the motion, which is a second feedback with the same delay; the model as feedforward makes it stronger.
+    - max |S| of the channel is at most `MOTION_PEAK_FACTOR` · max(M_s, max |S| of the PID alone), for this K_x or √K_y
+      and for smaller ones, with and without the model as feedforward (`sensitivity`). The motion controller makes the
+      command follow the motion, which is a second feedback with the same delay; the model as feedforward makes it
+      stronger.
 
     T starts at the control period, or at half the lag of the slower velocity loop where that is more, *chosen*, and
     grows in steps of 10 %; the T with the largest K_x √K_y is taken. A slower prefilter lowers max |S| as long as the
@@ -207,7 +208,7 @@ def _motion(
     root = (np.sin(angle) / np.cos(1.5 * angle)) ** 2
     kappa = root**1.5 * np.sin(1.5 * angle) - root * np.cos(angle)
     turned = robot.max_rotation_acceleration / robot.max_speed**2
-    reached = (robot.max_acceleration / ERROR) ** (1 / 2), (turned / ERROR) ** (1 / 3)
+    reached = (robot.max_acceleration / CORRECTED_ERROR) ** (1 / 2), (turned / CORRECTED_ERROR) ** (1 / 3)
     shares = np.linspace(0, 1, 21)
     prefilter = max(period, v_lag / 2, omega_lag / 2) if given is None else max(period, given)
     best, chosen = 0.0, (0.0, 0.0, prefilter)
@@ -231,7 +232,7 @@ def _motion(
 
 def _kept(shares: Array, peaks: Array) -> float:
     """Returns the largest share up to which the peaks keep the bound; the first peak is that of the PID alone."""
-    bound = WHOLE * max(M_S, peaks[0])
+    bound = MOTION_PEAK_FACTOR * max(M_S, peaks[0])
     beyond = np.flatnonzero(peaks > bound)
     if beyond.size == 0:
         return float(shares[-1])

@@ -8,11 +8,11 @@ from numpy.typing import ArrayLike
 from mrctl.kernel import Array, kernel
 from mrctl.theory.robot import Robot
 
-NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
+FEATURE_NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
 # Kernels are compiled with these sizes, so they must stand in a file that holds kernels; see `mrctl.kernel`.
 FEATURES, CHANNELS = 8, 2  # the physical features, and the channels of the velocity controller
 SIGN_SPEED = 0.05  # m/s, width of the smooth sign function of the friction
-SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
+STICTION_SPEED = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
 
 
 @kernel

@@ -62,16 +62,18 @@ NONE, FALLBACK = range(2)
 REASONS = ("", "sustained oscillation", "far from the reference", "velocity far from the command", "output not finite")
 _, OSCILLATION, FAR, FAST, BROKEN = range(5)
 
-SLOWEST = 1.0  # s, longest half-wave of an oscillation; what a lap asks for is slower
-SUSTAINED = 16  # half-waves in a row that make an oscillation
-RECENT = 1.0  # s, time constant with which the peak of a deviation decays
-MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
-RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
-TOLERATED = 0.15  # ρ̄: posture error in m that is always tolerated; a run fails at a lateral one of 1 m
-LEAST = 0.27, 0.75  # m/s and rad/s, errors of V and θ̇ that are always tolerated; slow robots start with them
-ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
+MAX_HALF_WAVE = 1.0  # s, longest half-wave of an oscillation; what a lap asks for is slower
+SUSTAINED_HALF_WAVES = 16  # half-waves in a row that make an oscillation
+PEAK_DECAY = 1.0  # s, time constant with which the peak of a deviation decays
+# s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
+AVERAGING_TIME = 0.5
+RESUME_TIME = 5.0  # s in which a learner that resumes at full gain gets its authority back
+TOLERATED_POSTURE = 0.15  # ρ̄: posture error in m that is always tolerated; a run fails at a lateral one of 1 m
+# m/s and rad/s, errors of V and θ̇ that are always tolerated; slow robots start with them
+TOLERATED_VELOCITIES = (0.27, 0.75)
+HEADING_ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
 BACK_OFF = 3.0  # factor by which each attempt learns more slowly, and waits longer
-UNSURE = 0.1  # further factor on the learning gain of a stage that cannot be reset to its initial weights
+NO_RESET_FACTOR = 0.1  # further factor on the learning gain of a stage that cannot be reset to its initial weights
 
 
 @kernel
@@ -119,14 +121,14 @@ def guard(
         fallback = nominal[k] if g.model else 0.0
         deviation = g.authority * (g.limited[k] - fallback)
         wave = swing(feedback[k], k, period, g.feedback)
-        count_half_waves(wave, k, g.oscillation * g.harmless[k], SLOWEST, period, g.half_waves)
+        count_half_waves(wave, k, g.oscillation * g.harmless[k], MAX_HALF_WAVE, period, g.half_waves)
         g.output[k] = g.limited[k]
         if g.authority < 1.0:
             g.bump[k] *= g.fade / (g.fade + period)
             g.output[k] = fallback + deviation + g.bump[k]
-        g.handed[k] *= RECENT / (RECENT + period)
-        g.deviation[k] = max(abs(deviation), abs(g.handed[k]), RECENT / (RECENT + period) * g.deviation[k])
-        g.model_error[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.model_error[k])
+        g.handed[k] *= PEAK_DECAY / (PEAK_DECAY + period)
+        g.deviation[k] = max(abs(deviation), abs(g.handed[k]), PEAK_DECAY / (PEAK_DECAY + period) * g.deviation[k])
+        g.model_error[k] += period / (AVERAGING_TIME + period) * (voltage[k] - nominal[k] - g.model_error[k])
     trouble = worst_trouble(g, broken, error, command, twist)
 
     g.hold_left -= period
@@ -138,7 +140,7 @@ def guard(
         g.action, g.reason = NONE, 0.0
 
     if g.action != FALLBACK:
-        g.authority = min(1.0, g.authority + period * g.gain / RETURN)
+        g.authority = min(1.0, g.authority + period * g.gain / RESUME_TIME)
     g.frozen = g.action == FALLBACK
     for k in range(2):
         g.teaching[k] = g.gain * feedback[k]
@@ -150,17 +152,17 @@ def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Arr
 
     While the learner acts, trouble counts only if the learner deviated so far that it may have caused it.
     """
-    posture = np.hypot(np.hypot(error[0], error[1]), ARM * error[2])
+    posture = np.hypot(np.hypot(error[0], error[1]), HEADING_ARM * error[2])
     g.nearest = min(g.nearest, posture)
     if broken:
         return BROKEN
     for k in range(2):
         deviation = np.inf if g.action == FALLBACK else g.deviation[k]
-        if deviation > g.harmless_to_posture[k] and posture > max(TOLERATED, g.growth * g.nearest):
+        if deviation > g.harmless_to_posture[k] and posture > max(TOLERATED_POSTURE, g.growth * g.nearest):
             return FAR
         if deviation > g.harmless[k] and abs(command[k] - twist[k]) > g.region[k]:
             return FAST
-        if deviation > g.oscillation * g.harmless[k] and g.half_waves.count[k] >= SUSTAINED:
+        if deviation > g.oscillation * g.harmless[k] and g.half_waves.count[k] >= SUSTAINED_HALF_WAVES:
             return OSCILLATION
     return 0
 
@@ -274,7 +276,7 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     rows["model"] = [s.fallback == "model" for s in settings]
     rows["hands_over"] = True
     rows["range"] = ranges(robot)
-    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], LEAST)
+    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], TOLERATED_VELOCITIES)
     rows["harmless"], rows["harmless_to_posture"] = harmless(rows["region"], gains)
     rows["nearest"] = np.inf
     rows["gain"] = rows["authority"] = 1.0
@@ -302,4 +304,4 @@ def harmless(region: Array, gains: Array) -> tuple[Array, Array]:
         D = ē/‖G_e‖₁ and D_ρ = min(D, ρ̄/(√2 ‖G_ρ‖₁)), `(…, 2)`.
     """
     velocity = region / gains[..., 0]
-    return velocity, np.minimum(velocity, TOLERATED / (np.sqrt(2.0) * gains[..., 1]))
+    return velocity, np.minimum(velocity, TOLERATED_POSTURE / (np.sqrt(2.0) * gains[..., 1]))

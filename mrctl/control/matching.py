@@ -25,8 +25,8 @@ import numpy as np
 
 from mrctl.kernel import Array, Row, Rows, kernel
 
-SETTLED = 6.0  # time constants until the two filters of `low_pass` have forgotten their initial state
-LAG = 2  # periods, hold and sampling, *chosen*; with one the worst robots in `field` do worse
+SETTLING_TIMES = 6.0  # time constants until the two filters of `low_pass` have forgotten their initial state
+HOLD_PERIODS = 2  # periods, hold and sampling, *chosen*; with one the worst robots in `field` do worse
 MATCHED = np.dtype(
     [
         ("tick", "i8"),  # number of control ticks so far
@@ -115,7 +115,7 @@ def low_pass(signal: float, k: int, share: float, once: Array, twice: Array) -> 
 
 def histories(size: int, delay: int, width: int) -> Array:
     """Returns empty queues for `recall`, `(B, delay + 2, width)`; the delay is in control periods."""
-    return np.zeros((size, delay + LAG, width))
+    return np.zeros((size, delay + HOLD_PERIODS, width))
 
 
 @kernel

@@ -64,15 +64,16 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.cholesky import factor, forward, solve
-from mrctl.control.features import FEATURES, SLOW, feature_scale, features, linear, symmetric_product
+from mrctl.control.features import FEATURES, STICTION_SPEED, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
-from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, note_sent, queues
+from mrctl.control.matching import MATCHED, SETTLING_TIMES, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 
 SIGNALS = FEATURES + 2  # filtered signals: the features and the voltage of the two channels
-NEWTON, NEAR = 100, 1e-6  # largest number of steps of the projection; share by which its result may exceed the ball
+# largest number of steps of the projection; share by which its result may exceed the ball
+MAX_NEWTON_STEPS, PROJECTION_TOLERANCE = 100, 1e-6
 
 
 @kernel
@@ -158,7 +159,7 @@ def project(M: Array, b: Array, radius: float, shifted: Array, q: Array) -> None
         return
     target = np.empty(n)
     symmetric_product(M, b, target)
-    for _ in range(NEWTON):
+    for _ in range(MAX_NEWTON_STEPS):
         for i in range(n):
             for j in range(n):
                 shifted[i, j] = M[i, j]
@@ -166,7 +167,7 @@ def project(M: Array, b: Array, radius: float, shifted: Array, q: Array) -> None
         factor(shifted, shifted)
         solve(shifted, target, b)
         size = np.sqrt(dot(b, b))
-        if size <= radius * (1 + NEAR):
+        if size <= radius * (1 + PROJECTION_TOLERANCE):
             return
         forward(shifted, b, q)
         mu += size * size / dot(q, q) * (size / radius - 1)
@@ -216,7 +217,7 @@ def filter_motion(command: Array, twist: Array, period: float, queue: Rows, scal
         if j < FEATURES:
             s.w[j] = s.twice[j]
     s.age += s.share
-    return s.age > SETTLED
+    return s.age > SETTLING_TIMES
 
 
 @kernel
@@ -240,7 +241,7 @@ def learn(
     note_sent(voltage, command, robot.rigid, s.sent)
     settled = filter_motion(command, twist, period, queue[i], scale, robot, s)
     now = s.matched.twist
-    moves = abs(now[0]) + robot.half_track * abs(now[1]) > SLOW
+    moves = abs(now[0]) + robot.half_track * abs(now[1]) > STICTION_SPEED
     added[0] = added[1] = 0.0
     if settled and moves and frozen == 0:
         for k in range(2):

@@ -10,7 +10,7 @@ import numpy as np
 
 from mrctl.kernel import Row, kernel
 
-SMOOTH, DRIFT = 0.01, 0.3  # s, time constants of the filters that remove noise and slow motion
+NOISE_FILTER, DRIFT_FILTER = 0.01, 0.3  # s, time constants of the filters that remove noise and slow motion
 
 SWING = np.dtype(
     [
@@ -33,8 +33,8 @@ HALF_WAVES = np.dtype(
 @kernel
 def swing(value: float, k: int, period: float, s: Row) -> float:
     """Returns a signal of channel k without noise and slow motion; `s` is a record of `SWING`, in and out."""
-    s.low_pass[k] += period / (SMOOTH + period) * (value - s.low_pass[k])
-    s.slow_mean[k] += period / (DRIFT + period) * (s.low_pass[k] - s.slow_mean[k])
+    s.low_pass[k] += period / (NOISE_FILTER + period) * (value - s.low_pass[k])
+    s.slow_mean[k] += period / (DRIFT_FILTER + period) * (s.low_pass[k] - s.slow_mean[k])
     return s.low_pass[k] - s.slow_mean[k]
 
 

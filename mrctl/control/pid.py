@@ -11,7 +11,7 @@ from mrctl.control.design import design
 from mrctl.control.margins import Gains
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
-from mrctl.theory.perturbation import LONGEST_DELAY
+from mrctl.theory.perturbation import MAX_DELAY
 from mrctl.theory.robot import Robot
 
 Pair = tuple[float, float]
@@ -66,13 +66,15 @@ class Pid(Record):
     time_constant: Annotated[float, Field(ge=0.03, le=2)] | None = None
     """Closed-loop time constant λ of both channels in s, with which the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ)
     for the plant K/(τ s + 1); by default the gains are the largest that the delay allows."""
-    delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] | None = None
-    """Delay from measurement to voltage in s that the design of the gains assumes; by default that of `sensing`."""
+    delay: Annotated[float, Field(ge=0, le=MAX_DELAY)] | None = None
+    """Delay from measurement to voltage in s that the design of the gains assumes; by default that of `sensing`;
+    without effect with `time_constant`."""
     retune: bool = True
     """Whether each oscillation slows the controllers for the rest of the run, as 10 ms more delay would: in turn the
     motion controller with the learner, and the PID; without effect with `time_constant`."""
     lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones."""
+    """Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones; without
+    effect with `time_constant`."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Derivative time K_d/K_p in s; none by default, as the gains are designed for PI control."""
     derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
@@ -111,8 +113,8 @@ class Pid(Record):
         else:
             common, second = imc(robot, self.time_constant)
             if rigid:
-                faster = STEERING_LAG / self.time_constant
-                second = Gains(STEERING.k_p * faster, STEERING.k_i * faster)
+                faster = STEERING_TIME_CONSTANT / self.time_constant
+                second = Gains(STEERING_GAINS.k_p * faster, STEERING_GAINS.k_i * faster)
         if rigid:
             k_p = second.k_p if self.steering_kp is None else self.steering_kp
             k_i = second.k_i if self.steering_ki is None else self.steering_ki
@@ -120,7 +122,7 @@ class Pid(Record):
         return common, second
 
 
-STEERING, STEERING_LAG = Gains(0.3, 5.0), 0.15
+STEERING_GAINS, STEERING_TIME_CONSTANT = Gains(0.3, 5.0), 0.15
 """Gains of a steering channel, in rad/s per rad/s and 1/s, at this λ in s; they scale with 1/λ. *Chosen*."""
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.control.design import MotionDesign, points
-from mrctl.control.guard import ARM
+from mrctl.control.guard import HEADING_ARM
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
 from mrctl.kernel import Array
@@ -25,7 +25,7 @@ from mrctl.theory.linear import Linear
 from mrctl.theory.robot import Robot
 
 DIRECTIONS = 32  # combinations of two errors in which the peak of their length is looked for
-HORIZON = 10.0  # s over which responses are added up, rounded up to 2ⁿ periods
+RESPONSE_TIME = 10.0  # s over which responses are added up, rounded up to 2ⁿ periods
 
 
 class Peaks(NamedTuple):
@@ -35,8 +35,8 @@ class Peaks(NamedTuple):
         velocity: From a disturbance in V (rad/s on a steering channel) to the error of the velocity for the same
             command, in m/s or rad/s.
         posture: From that disturbance to what it contributes to the posture error of the guard in m: the longitudinal
-            error, or the length of lateral error and `ARM` times the heading error. Both are infinite where the loop is
-            unstable.
+            error, or the length of lateral error and `HEADING_ARM` times the heading error. Both are infinite where the
+            loop is unstable.
     """
 
     velocity: float
@@ -85,7 +85,8 @@ class LinearLoop:
             filtered correction, the position and heading errors, the voltages that have not acted yet, and the rates of
             the correction over which the motion is predicted.
         pulse: State after a disturbance of one unit that lasts one period.
-        errors: Rows that give the velocity error, the position error and `ARM` times the heading error of a state.
+        errors: Rows that give the velocity error, the position error and `HEADING_ARM` times the heading error of a
+            state.
         state: Index of the velocity, the integral, the filtered correction, the position error and the heading error in
             the state, by name.
     """
@@ -133,12 +134,12 @@ class LinearLoop:
         self.step = np.stack([after(column, 0.0) for column in np.eye(size)], axis=1)
         self.pulse = after(np.zeros(size), 1.0)
         self.errors = np.zeros((3, size))
-        self.errors[0, c], self.errors[0, 0], self.errors[1, p], self.errors[2, h] = 1.0, -1.0, 1.0, ARM
+        self.errors[0, c], self.errors[0, 0], self.errors[1, p], self.errors[2, h] = 1.0, -1.0, 1.0, HEADING_ARM
         self.state = {"velocity": 0, "integral": i, "correction": c, "position": p, "heading": h}
-        self._doublings = int(np.ceil(np.log2(HORIZON / period)))
+        self._doublings = int(np.ceil(np.log2(RESPONSE_TIME / period)))
 
     def response(self, state: Array) -> Array:
-        """Velocity error, position error and `ARM` times the heading error that follow from a state, `(3, n)`."""
+        """Velocity error, position error and `HEADING_ARM` times the heading error after a state, `(3, n)`."""
         states, power = state[:, None], self.step
         for _ in range(self._doublings):  # x(n … 2n) = Aⁿ x(0 … n)
             states, power = np.hstack([states, power @ states]), power @ power

@@ -7,7 +7,7 @@ import numpy as np
 from mrctl.control.features import SIGN_SPEED
 from mrctl.kernel import Array, Row, kernel
 
-REST = 0.02  # m/s; below it the fork holds its angle
+HOLD_SPEED = 0.02  # m/s; below it the fork holds its angle
 
 ALLOCATION = np.dtype(
     [
@@ -44,7 +44,7 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
     """
     sense = 1.0 if v >= 0 else -1.0
     forward, side = sense * v, sense * robot.wheelbase * omega
-    if not forward > REST:
+    if not forward > HOLD_SPEED:
         s.rate = 0.0
         return
     speed = np.hypot(forward, side)

@@ -13,7 +13,7 @@ from mrctl.control.features import CHANNELS, FEATURES
 from mrctl.kernel import Array
 from mrctl.record import InputError, reading
 
-LARGEST = 64 * 2**20  # bytes of the arrays of a file
+MAX_BYTES = 64 * 2**20  # bytes of the arrays of a file
 
 
 def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
@@ -144,8 +144,8 @@ def read_arrays(path: str | Path, field: str, expected: Mapping[str, tuple[int, 
     if zipfile.is_zipfile(path):  # as torch writes them
         with reading(path), zipfile.ZipFile(path) as archive:
             size = sum(part.file_size for part in archive.infolist())
-    if size > LARGEST:
-        raise InputError(f"{field}: {path}: {size / 2**20:,.0f} MiB of weights, at most {LARGEST / 2**20:g}")
+    if size > MAX_BYTES:
+        raise InputError(f"{field}: {path}: {size / 2**20:,.0f} MiB of weights, at most {MAX_BYTES / 2**20:g}")
     writer = ""
     try:
         if Path(path).suffix == ".safetensors":

@@ -30,8 +30,8 @@ OBSERVATIONS: dict[str, int] = {
 commanded steering angle (rad); voltages sent last (V)."""
 EPISODE_METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 """Metrics at the end of an episode, root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
-RESIDUAL = 0.25  # largest residual, as a share of the supply
-NEAR = 0.05  # distance from the reference in m at which the reward is a half
+MAX_RESIDUAL = 0.25  # largest residual, as a share of the supply
+HALF_REWARD_DISTANCE = 0.05  # distance from the reference in m at which the reward is a half
 
 
 @kernel
@@ -53,7 +53,7 @@ def observe(
             out[9 + k], out[12 + k] = s.wheel_speeds[k] / radius, control[i].allocation.command[k]
         out[11] = control[i].allocation.angle
         x, y, theta = error[0], error[1], half_track * error[2]
-        reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / NEAR**2)
+        reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / HALF_REWARD_DISTANCE**2)
         if p.failed:
             reward[i] = 0.0
             for k in range(len(out)):  # the state may have diverged
@@ -158,11 +158,18 @@ class Episodes:
         self._action = np.zeros((len(scenarios), 2)) if self._agent is None else self._agent.request
         robot = self.plant.robot
         limits = robot.max_speed, robot.max_rotation
-        share = RESIDUAL if action == "residual" else 1.0
+        share = MAX_RESIDUAL if action == "residual" else 1.0
         self.bound = np.array(limits if action == "twist" else [share * robot.supply] * 2)
         wheel_rate = (robot.max_speed + robot.half_track * robot.max_rotation) / robot.wheel_radius
         self.scale = np.array(
-            [NEAR, NEAR, NEAR / robot.half_track, *limits, *limits, robot.max_acceleration]
+            [
+                HALF_REWARD_DISTANCE,
+                HALF_REWARD_DISTANCE,
+                HALF_REWARD_DISTANCE / robot.half_track,
+                *limits,
+                *limits,
+                robot.max_acceleration,
+            ]
             + [robot.max_rotation_acceleration, *[wheel_rate] * 2, robot.steering_limit, *[robot.supply] * 2]
         )
         self._given, self._draw = [s.perturbation for s in self.scenarios], draw

@@ -31,7 +31,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
-SEEDS = 2**32  # number of seeds that a scenario can have
+MAX_SEEDS = 2**32  # number of seeds that a scenario can have
 RENDER_MODES = ["rgb_array"]
 
 
@@ -110,8 +110,8 @@ class TrackingEnv(gymnasium.Env):
             InputError: An option is unknown or invalid.
         """
         super().reset(seed=seed)
-        drawn = int(self.np_random.integers(SEEDS))
-        self.episodes.begin_all([drawn if seed is None else seed % SEEDS], [asked(options)])
+        drawn = int(self.np_random.integers(MAX_SEEDS))
+        self.episodes.begin_all([drawn if seed is None else seed % MAX_SEEDS], [asked(options)])
         return self.episodes.observe()[0][0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -244,13 +244,13 @@ class TrackingVectorEnv(VectorEnv):
         drawn = [self._draw(row) for row in range(self.num_envs)]
         perturbation = asked(options)
         several = perturbation if isinstance(perturbation, list | tuple) else [perturbation] * self.num_envs
-        self.episodes.begin_all([d if s is None else s % SEEDS for s, d in zip(seeds, drawn, strict=True)], several)
+        self.episodes.begin_all([d if s is None else s % MAX_SEEDS for s, d in zip(seeds, drawn, strict=True)], several)
         self._over[:] = False
         return self.episodes.observe()[0], {}
 
     def _draw(self, row: int) -> int:
         """Draws the seed of a robot's next episode."""
-        return int(self._randoms[row].integers(SEEDS))
+        return int(self._randoms[row].integers(MAX_SEEDS))
 
     def step(self, actions: Array) -> tuple[Array, Array, NDArray[np.bool], NDArray[np.bool], dict[str, Any]]:
         """Runs one control period of every robot; a robot whose episode was over begins another, with reward 0.

@@ -16,8 +16,8 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.rays import Scan
 
-END = 1.0  # reward of an arrival, and minus that of a failure
-WORLD = "doorway:3"  # of the default mission
+END_REWARD = 1.0  # reward of an arrival, and minus that of a failure
+DEFAULT_WORLD = "doorway:3"  # of the default mission
 
 
 class Looking(AgentMotion):
@@ -88,7 +88,7 @@ class Navigating(Episodes):
         """Settles as `Episodes.settle`, and computes the reward of the tick."""
         super().settle()
         before, self._away = self._away, self._distance()
-        end = np.where(self.arrived(), END, -END) * self.ended()[0]
+        end = np.where(self.arrived(), END_REWARD, -END_REWARD) * self.ended()[0]
         self._reward = np.where(self._drives, np.nan_to_num(before - self._away) + end, 0.0)
 
     def metrics(self, row: int) -> dict[str, float]:
@@ -123,4 +123,4 @@ def read_mission(scenario: Scenario | str | Path | None) -> Scenario:
     Raises:
         InputError: The file is not a valid scenario.
     """
-    return prepared(task_of(WORLD, Scenario()), Scenario())[1] if scenario is None else read(scenario)
+    return prepared(task_of(DEFAULT_WORLD, Scenario()), Scenario())[1] if scenario is None else read(scenario)

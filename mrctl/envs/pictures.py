@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from mrctl.envs.episodes import Episodes
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
-from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW, draw_line
+from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW_PIXELS, draw_line
 from mrctl.record import InputError
 
 WIDTH, HEIGHT = 640, 480  # pixels
-POINTS = 200  # number of points of the reference
-VIEW = 5.0  # distance of the camera as a multiple of the size of the robot
+REFERENCE_POINTS = 200  # number of points of the reference
+VIEW_DISTANCE = 5.0  # distance of the camera as a multiple of the size of the robot
 AZIMUTH, ELEVATION = 60.0, -35.0  # of the camera's view, in degrees
 
 
@@ -38,7 +38,7 @@ class Pictures:
             looks = physics.model.ptr.vis
             looks.global_.offwidth, looks.global_.offheight = WIDTH, HEIGHT
             # Larger values take most of the time without a GPU.
-            looks.quality.shadowsize, looks.quality.offsamples = SHADOW, 0
+            looks.quality.shadowsize, looks.quality.offsamples = SHADOW_PIXELS, 0
         return self._drawn[id(model)]
 
     def draw(self, robot: int = 0) -> NDArray[np.uint8]:
@@ -54,7 +54,7 @@ class Pictures:
         data = physics.data
         now, size = plant.reading[robot], plant.robot.size
         reference = self._episodes.scenarios[robot].reference
-        course = reference.sample(np.linspace(0, reference.period, POINTS)).pose * [1, 1, 0] + [0, 0, 0.004]
+        course = reference.sample(np.linspace(0, reference.period, REFERENCE_POINTS)).pose * [1, 1, 0] + [0, 0, 0.004]
         data.qpos[:] = plant.qpos[robot]
         data.mocap_pos[:], data.mocap_quat[:] = (part[robot] for part in plant.mocap)
         physics.forward()
@@ -69,5 +69,5 @@ class Pictures:
             draw_line(scene, course, size / 40, REFERENCE_COLOUR)
 
         camera = MovableCamera(physics, HEIGHT, WIDTH, scene_callback=add_course)
-        camera.set_pose(np.nan_to_num([*now["pose"][:2], now["z"]]), VIEW * size, AZIMUTH, ELEVATION)
+        camera.set_pose(np.nan_to_num([*now["pose"][:2], now["z"]]), VIEW_DISTANCE * size, AZIMUTH, ELEVATION)
         return camera.render()

@@ -43,8 +43,8 @@ from mrctl.theory.kinematics import steering_angle
 
 SIZES = (1, 16, 64, 256, 1024)
 REPETITIONS = 41  # many short turns, so that neighbouring turns share the load of the machine
-CHUNK = 1500  # control periods of one turn, summed over the robots; a turn takes a twentieth of a second
-WARM = 20  # control periods before the measurement begins
+TICKS_PER_TURN = 1500  # control periods of one turn, summed over the robots; a turn takes a twentieth of a second
+WARM_TICKS = 20  # control periods before the measurement begins
 CONTROLS = ["voltage_left", "voltage_right", "steering_command", "steering_rate_command"]
 PARTS: dict[str, tuple[Any, str]] = {
     "physics": (BatchPlant, "_advance"),
@@ -55,14 +55,14 @@ PARTS: dict[str, tuple[Any, str]] = {
     "record": (Log, "record"),
 }
 STOPWATCH = "stopwatch"
-TURNS = 16  # of the loop with and without stopwatches
-LEAST_TICKS = 17  # of such a turn; so both kinds meet a tick in which the sensors' noise is drawn, each 256th
+STOPWATCH_TURNS = 16  # of the loop with and without stopwatches
+MIN_STOPWATCH_TICKS = 17  # of such a turn; so both kinds meet a tick in which the sensors' noise is drawn, each 256th
 
 
 def run(
     sizes: Sequence[int] = SIZES,
     repetitions: int = REPETITIONS,
-    chunk: int = CHUNK,
+    chunk: int = TICKS_PER_TURN,
     worlds: int = bench_navigation.WORLDS,
 ) -> dict[str, Any]:
     """Measures the speed of the closed loop and of its parts, and of navigation, in three minutes on two cores.
@@ -153,13 +153,13 @@ def build(size: int, ticks: int, threads: int = 1, tier: Tier = "ideal") -> list
         threads: Number of threads, each of which gets a simulation with its share of the robots, as in `simulate`.
         tier: Sensing tier; the record of `ideal` alone holds the voltages that act.
     """
-    laps = math.ceil((WARM + ticks) / Scenario(laps=1).ticks)
+    laps = math.ceil((WARM_TICKS + ticks) / Scenario(laps=1).ticks)
     scenarios = [Scenario(seed=seed, laps=laps, sensing=Sensing(tier=tier)) for seed in range(size)]
     with mock.patch("mrctl.loop.simulation.build", BatchPlant):
         simulations = [simulation for _, simulation in split(scenarios, list(range(size)), threads)]
     for simulation in simulations:
         simulation.log.ticks.view(float).fill(np.nan)  # memory that a virtual machine must first get takes 14 µs a page
-    run_all(simulations, ticks=WARM)
+    run_all(simulations, ticks=WARM_TICKS)
     return simulations
 
 
@@ -251,10 +251,10 @@ def _parts(size: int, chunk: int) -> dict[str, float]:
 
     Means, because some ticks cost more: those with a late fix, and each 256th, in which the sensors' noise is drawn.
     """
-    ticks = max(LEAST_TICKS, chunk // size // TURNS)
-    (simulation,) = build(size, 2 * ticks * TURNS, tier="lab")
+    ticks = max(MIN_STOPWATCH_TICKS, chunk // size // STOPWATCH_TURNS)
+    (simulation,) = build(size, 2 * ticks * STOPWATCH_TURNS, tier="lab")
     whole, seconds = 0.0, {}
-    for _ in range(TURNS):
+    for _ in range(STOPWATCH_TURNS):
         start = time.perf_counter()
         for _ in range(ticks):
             simulation.step()
@@ -263,8 +263,8 @@ def _parts(size: int, chunk: int) -> dict[str, float]:
             for _ in range(ticks):
                 simulation.step()
     own = statistics.mean(seconds.pop(STOPWATCH))
-    parts = {name: 1e6 * (sum(spent) / (ticks * TURNS) - own) for name, spent in seconds.items()}
-    return parts | {"the rest": 1e6 * whole / (ticks * TURNS) - sum(parts.values())}
+    parts = {name: 1e6 * (sum(spent) / (ticks * STOPWATCH_TURNS) - own) for name, spent in seconds.items()}
+    return parts | {"the rest": 1e6 * whole / (ticks * STOPWATCH_TURNS) - sum(parts.values())}
 
 
 @contextmanager

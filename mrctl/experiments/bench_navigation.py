@@ -19,7 +19,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.navigation import planning
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.hybrid_astar import cost_to_go, plan, space
-from mrctl.navigation.mppi import SAMPLES, SPREAD, TEMPERATURE, WORTH, Mppi
+from mrctl.navigation.mppi import MAX_COST_DIFFERENCE, NOISE, SAMPLES, TEMPERATURE, Mppi
 from mrctl.navigation.planning import Avoid, prepared
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
 from mrctl.navigation.tasks import task_of
@@ -28,8 +28,8 @@ from mrctl.physics.obstacles import multi_ray
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.lidar import Lidar
-from mrctl.sensing.localisation import POINTS, RAYS
-from mrctl.sensing.particles import HIT, LEAST, Particles, weigh
+from mrctl.sensing.localisation import MAX_POINTS, MAX_RAYS
+from mrctl.sensing.particles import HIT_DEVIATION, MIN_PARTICLES, Particles, weigh
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Box, Disc, Obstacles, Surroundings
@@ -42,7 +42,7 @@ SIDE, CELL, DISCS = 38.4, 0.1, 100  # m, m; side of the worlds of random discs a
 RADIUS = 0.5  # m, turning radius of plans there
 KINDS = "cellular", "corridor", "slalom", "doorway", "warehouse"
 MISSION = "doorway:3"
-MOST_TURNS = 5  # of the missions
+MAX_TURNS = 5  # of the missions
 SCENARIO = Scenario(prior="model", learner="none")
 
 
@@ -61,7 +61,7 @@ def run(repetitions: int, worlds: int = WORLDS) -> dict[str, Any]:
     return {
         "pairs": [_lidar(repetitions), _particles(repetitions), _mppi(repetitions)],
         "plans": [_random_discs(worlds), _generated(worlds)],
-        "missions": _missions(min(repetitions, MOST_TURNS)),
+        "missions": _missions(min(repetitions, MAX_TURNS)),
     }
 
 
@@ -138,16 +138,16 @@ def _particles(turns: int) -> dict[str, Any]:
     field = field_of(outlines, np.full(2, -7.0), np.full(2, 7.0), 0.05)
     pose = np.zeros(3)
     scan = lidar.scan(pose, outlines, random)
-    points, rays = lidar.points(scan, POINTS["particles"]), lidar.rays(scan, RAYS)
-    filtered, weights = Particles(field, 0, pose, np.full(3, 0.02)), np.empty(LEAST)
+    points, rays = lidar.points(scan, MAX_POINTS["particles"]), lidar.rays(scan, MAX_RAYS)
+    filtered, weights = Particles(field, 0, pose, np.full(3, 0.02)), np.empty(MIN_PARTICLES)
     first = filtered.particles.copy()
-    likelihoods = partial(weigh.compiled, first, points, rays[:0], field, HIT, weights)
+    likelihoods = partial(weigh.compiled, first, points, rays[:0], field, HIT_DEVIATION, weights)
 
     def update() -> None:
         filtered.particles = first.copy()
         filtered.update(0.0, 0.0, points, rays)
 
-    name = f"particle filter, {LEAST} particles, {len(points)} beams"
+    name = f"particle filter, {MIN_PARTICLES} particles, {len(points)} beams"
     return _pair(name, update, "its likelihoods alone", likelihoods, turns)
 
 
@@ -164,12 +164,12 @@ def _mppi(turns: int) -> dict[str, Any]:
         stage.output(pose, twist, np.zeros((1, 7)))
     arguments = watched.call_args.args
     (bounds,) = stage.bounds
-    spread = np.array(SPREAD) * (bounds.speed, bounds.rotation)
+    spread = np.array(NOISE) * (bounds.speed, bounds.rotation)
     knots = np.random.default_rng(0).standard_normal((SAMPLES, KNOTS, 2)) * spread
     nominal, period, scene = np.zeros((STEPS, 2)), own.motion_period, arguments[-1]
     twists, costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
     state = pose[0], twist[0], twist[0], 0.0, period, bounds, scene
-    bare = partial(roll_out.compiled, knots, nominal, *state, WORTH * TEMPERATURE, twists, costs)
+    bare = partial(roll_out.compiled, knots, nominal, *state, MAX_COST_DIFFERENCE * TEMPERATURE, twists, costs)
     name = f"MPPI, {SAMPLES:,} samples of {STEPS} steps"
     return _pair(name, partial(stage.choose, *arguments), "its roll-outs alone", bare, turns)
 

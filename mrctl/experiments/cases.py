@@ -43,16 +43,18 @@ HARD = {
 STEPS = (*(name for name in UNCERTAIN if name != "mass -50 %"), "all")
 LASTING = ("left_radius_factor", "right_radius_factor", "slope")  # fields that do not change while a robot drives
 FLOOR, HALF = ("nominal", "all"), ", half the step"  # plants that are also driven with half the physics step
-LATE = 20  # laps before a late step, after which what a learner knows of the former plant has long been confirmed
+# laps before a late step, after which what a learner knows of the former plant has long been confirmed
+LATE_STEP_LAPS = 20
 NO_SPREAD = (0.0, 0.0, 0.0)  # no initial offset, which would hide what learning costs in lap 1
 FAST, SHORT, LONG = 9.0, 12.0, 18.0  # s, lap times: near the robot's limits, the benchmark's, a slow one to learn on
 LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; few, so that runs share a batch
 RANDOM_LAPS = 4
-MARGIN = 0.8  # share of the robot's limits that a random spline may ask for
-GRIP = 0.3  # tyre friction that a random spline relies on
+LIMIT_SHARE = 0.8  # share of the robot's limits that a random spline may ask for
+RELIED_FRICTION = 0.3  # tyre friction that a random spline relies on
 NO_WORSE = 1.02  # ratio to the error of PID alone up to which a feedforward does no harm
 MUCH_WORSE = 5.0  # and above which it does much
-BAND = 1.2  # largest ratio to the error before a step, or to the final one, that counts as recovered or converged
+# largest ratio to the error before a step, or to the final one, that counts as recovered or converged
+RECOVERED_RATIO = 1.2
 
 
 class Case(NamedTuple):
@@ -174,8 +176,8 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
         )
         add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
     if full:
-        late = Event(time=LATE * SHORT, perturbation=PERTURBATIONS["all"])
-        add("late", f"all, after {LATE} laps", LATE + 1, laps=LATE + 2, events=(late,))
+        late = Event(time=LATE_STEP_LAPS * SHORT, perturbation=PERTURBATIONS["all"])
+        add("late", f"all, after {LATE_STEP_LAPS} laps", LATE_STEP_LAPS + 1, laps=LATE_STEP_LAPS + 2, events=(late,))
     carried = Event(time=third * SHORT, learning=False, reference=slowed(loop(), SHORT))
     for name in ("all",) if quick else FLOOR:
         case = {"laps": third + 2, "events": (carried,), "perturbation": PERTURBATIONS[name]}
@@ -281,9 +283,9 @@ _KINDS = {
 
 def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
     """Draws a spline at changing speed; its lap time is the least of `LAP_TIMES` within the margins, or the next."""
-    careful = robot.model_copy(update={"tyre_friction": GRIP / MARGIN})
+    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / LIMIT_SHARE})
     while True:
-        course = random_spline(random, careful, MARGIN, MARGIN)
+        course = random_spline(random, careful, LIMIT_SHARE, LIMIT_SHARE)
         slower = int(random.integers(2))
         if times := [time for time in LAP_TIMES if time >= course.period]:
             return slowed(course, times[min(slower, len(times) - 1)])

@@ -32,8 +32,8 @@ from mrctl.theory.timing import Limits
 
 LAPS = 6
 RIVALS: tuple[FeedforwardName, ...] = ("model", "true_model", "model+observer")
-RESOLVED = 5  # replicates of each cell that are also driven with half the physics step
-LOG = "held_out.jsonl"
+HALF_STEP_REPLICATES = 5  # replicates of each cell that are also driven with half the physics step
+LOG_FILE = "held_out.jsonl"
 """Name of the log, with a line for each time that the cells were begun, and for each time that they were finished."""
 
 PLANTS: dict[str, Perturbation] = {
@@ -136,14 +136,16 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
 
 def _log(out: Path, values: Mapping[str, Any]) -> None:
     """Adds a line to the log, so that a drive that was begun is on record even without a result."""
-    with (out / LOG).open("a") as file:
+    with (out / LOG_FILE).open("a") as file:
         file.write(json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values}) + "\n")
 
 
 def _half(cell: Case) -> Case:
     """Returns the first replicates of a cell with half the physics step."""
     halved = {"physics_step": Scenario().physics_step / 2, "name": cell.name + HALF}
-    return Case(cell.name + HALF, cell.part, tuple(s.model_copy(update=halved) for s in cell.scenarios[:RESOLVED]))
+    return Case(
+        cell.name + HALF, cell.part, tuple(s.model_copy(update=halved) for s in cell.scenarios[:HALF_STEP_REPLICATES])
+    )
 
 
 def _settings(name: str) -> dict[str, Any]:
@@ -163,7 +165,10 @@ def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     for course in courses():
         whole = {plant: found[f"{course}; {plant}"] for plant in PLANTS}
         pairs = [
-            ({one: laps.isel(run=slice(RESOLVED)) for one, laps in own.items()}, found[f"{course}; {plant}{HALF}"])
+            (
+                {one: laps.isel(run=slice(HALF_STEP_REPLICATES)) for one, laps in own.items()},
+                found[f"{course}; {plant}{HALF}"],
+            )
             for plant, own in whole.items()
         ]
         for metric in COLUMNS:

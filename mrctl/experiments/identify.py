@@ -51,10 +51,11 @@ Lines = NDArray[np.complex128]
 PERIOD = 10.0  # s of the excitation
 PERIODS = 2  # periods that are averaged, after one in which the robot settles
 REPEATS = 8  # number of robots, each under its own signal
-TICK = 0.005  # s, for which a voltage is held
-FINE = 100  # physics steps per time constant; the first-order engine adds damping times half a step to the mass
-MODEL = 0.015  # relative error that effects outside equation (3) may cause
-TOLERANCE = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
+HOLD_TIME = 0.005  # s, for which a voltage is held
+# physics steps per time constant; the first-order engine adds damping times half a step to the mass
+STEPS_PER_TIME_CONSTANT = 100
+MODEL_ERROR = 0.015  # relative error that effects outside equation (3) may cause
+MAX_HALF_INTERVAL = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
 NOMINAL = Perturbation()
 NOT_IDENTIFIABLE = """\
 For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
@@ -79,7 +80,7 @@ class Constant(NamedTuple):
     @property
     def identifiable(self) -> bool:
         """Whether the interval is narrow enough for the constant to be identifiable."""
-        return self.high - self.low <= 2 * TOLERANCE * abs(self.estimate)
+        return self.high - self.low <= 2 * MAX_HALF_INTERVAL * abs(self.estimate)
 
 
 class Drive(NamedTuple):
@@ -130,7 +131,7 @@ def text(constants: Sequence[Constant]) -> str:
         cells.append([c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %", identifiable])
     parts = [markdown(header, cells), NOT_IDENTIFIABLE]
     if vague := [c.name for c in constants if not c.identifiable]:
-        parts.insert(1, f"These sensors cannot tell within {100 * TOLERANCE:g} %: {', '.join(vague)}.")
+        parts.insert(1, f"These sensors cannot tell within {100 * MAX_HALF_INTERVAL:g} %: {', '.join(vague)}.")
     return "\n\n".join(parts)
 
 
@@ -162,12 +163,12 @@ def identify(
     if perturbation.slope or not is_level(model):
         raise InputError(f"{'perturbation.slope' if perturbation.slope else 'world'}: the ground must be level")
     tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
-    substeps = max(5, int(np.ceil(FINE * TICK / tau)))
-    model = mjcf.load(world, steering, TICK / substeps, robot)
+    substeps = max(5, int(np.ceil(STEPS_PER_TIME_CONSTANT * HOLD_TIME / tau)))
+    model = mjcf.load(world, steering, HOLD_TIME / substeps, robot)
     plants = [build([one] * REPEATS, nominal, substeps, threads=1) for one in (model, on_skid(model))]
     for plant in plants:
         for row in range(REPEATS):
-            delay = round(perturbation.control_delay / TICK)
+            delay = round(perturbation.control_delay / HOLD_TIME)
             plant.perturb(row, perturbation, delay, sensing.driver, sensing.servo)
     random = np.random.default_rng([seed, 3])
     ahead, turning = (excite(plant, nominal, sensing, random, k == 1) for k, plant in enumerate(plants))
@@ -190,7 +191,7 @@ def identify(
 
 def _constant(name: str, values: Array, unit: str, true: float) -> Constant:
     mean = float(values.mean())
-    reach = float(np.hypot(scatter(values), MODEL * mean))
+    reach = float(np.hypot(scatter(values), MODEL_ERROR * mean))
     return Constant(name, unit, mean, mean - reach, mean + reach, true)
 
 
@@ -213,7 +214,7 @@ def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
     differs from its mean, half of its limit, by at most half of this mean; θ̇ stays within half of its limit and low
     enough that both wheels turn forwards; accelerations stay within two thirds of their limits.
     """
-    samples = round(PERIOD / TICK)
+    samples = round(PERIOD / HOLD_TIME)
     lines = np.arange(1, round(PERIOD * _bandwidth(robot)) + 1)
     speed = robot.max_speed / 2
     turn = min(robot.max_rotation / 2, speed / 4 / robot.half_track)
@@ -242,14 +243,14 @@ def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Gener
     period = np.stack([signals(robot, random, turns) for _ in range(REPEATS)], axis=1)  # (N, B, 2)
     highest, ticks = 2 * round(_bandwidth(robot) * PERIOD), (1 + PERIODS) * len(period)
     try:
-        sensing.check(TICK, ticks * TICK)
+        sensing.check(HOLD_TIME, ticks * HOLD_TIME)
     except ValueError as error:
         raise InputError(str(error)) from None
     for name in ("encoder_rate", "gyro_rate"):
-        if (rate := 1 / (TICK * sensing.periods(name, TICK))) <= 2 * highest / PERIOD:
+        if (rate := 1 / (HOLD_TIME * sensing.periods(name, HOLD_TIME))) <= 2 * highest / PERIOD:
             raise InputError(f"sensing.{name}: {rate:g} Hz, but the signals need more than {2 * highest / PERIOD:g} Hz")
     plant.reset(np.zeros((REPEATS, 3)), np.tile([robot.max_speed / 2, 0.0], (REPEATS, 1)))
-    sensors = Sensors([sensing] * REPEATS, random.integers(2**31, size=REPEATS).tolist(), TICK)
+    sensors = Sensors([sensing] * REPEATS, random.integers(2**31, size=REPEATS).tolist(), HOLD_TIME)
     samples = np.zeros((ticks + 1, REPEATS), sensors.ring.dtype)
     voltage, current = np.zeros((2, ticks + 1, REPEATS, 2))
     command = np.zeros((REPEATS, 4))
@@ -263,7 +264,7 @@ def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Gener
     if plant.failed.any():
         raise InputError(f"identify: a robot failed during the drive: {next(filter(None, plant.failure))}")
 
-    time = TICK * np.arange(ticks + 1)[-PERIODS * len(period) :]
+    time = HOLD_TIME * np.arange(ticks + 1)[-PERIODS * len(period) :]
 
     def seen(values: Array, new: NDArray[np.bool] | slice = slice(None)) -> tuple[Lines, Array]:
         return lines(time[new], values[-len(time) :][new], highest)
@@ -313,7 +314,7 @@ def _shaped(factors: NDArray, like: Lines) -> NDArray:
 
 def average(of: Lines) -> Lines:
     """Returns the lines of a signal's mean over each tick, from its lines at the ends of ticks."""
-    shift = 1j * TICK * frequencies(len(of))[1:]
+    shift = 1j * HOLD_TIME * frequencies(len(of))[1:]
     return _shaped(np.append(1.0, (1 - np.exp(-shift)) / shift), of) * of
 
 
@@ -361,7 +362,7 @@ def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robo
 
 def _mean_current(drive: Drive, resistance: float) -> Lines:
     """Returns lines of the mean current of each tick, which jumps with the voltage and then changes linearly."""
-    before = np.exp(-1j * TICK * frequencies(len(drive.current)))[:, None]
+    before = np.exp(-1j * HOLD_TIME * frequencies(len(drive.current)))[:, None]
     jump = (1 - before) * drive.voltage / resistance
     return (before * drive.current + jump + drive.current) / 2
 

@@ -17,7 +17,7 @@ from mrctl.results.dataset import versions
 from mrctl.sweep.jobs import code_digest
 from mrctl.sweep.pool import Cluster, Outcome, carry_out, check_address
 
-SHOWING = ("envs", "viewer", "cli", "__main__.py")  # rooms on which no experiment depends
+SHOWING_ROOMS = ("envs", "viewer", "cli", "__main__.py")  # rooms on which no experiment depends
 
 
 class Computation(NamedTuple):
@@ -62,7 +62,7 @@ class Journal:
         """
         self._scheduler, self._origin = scheduler, origin
         self.cores = cores() if scheduler is None else threads_of(scheduler)
-        self._file, head = file, json.loads(json.dumps(head | origin() | {"code": code_digest(SHOWING)}))
+        self._file, head = file, json.loads(json.dumps(head | origin() | {"code": code_digest(SHOWING_ROOMS)}))
         try:
             begun = file.read_text() if file.exists() else ""
             first, *rest = [json.loads(line) for line in begun[: begun.rfind("\n") + 1].splitlines()] or [head]
@@ -130,7 +130,7 @@ class Journal:
                 bar.update()
 
         computed = {k: pickle.dumps(parts[k].compute) for k in missing}
-        here = versions() | self._origin() | {"code": code_digest(SHOWING)}
+        here = versions() | self._origin() | {"code": code_digest(SHOWING_ROOMS)}
         pool = Cluster(Remote(computed, self._origin, here), "", scheduler)
         try:
             aside = carry_out(pool, missing, ended)
@@ -167,7 +167,7 @@ class Remote(NamedTuple):
 
     def __call__(self, _: str, job: int) -> Outcome:
         """Does a computation with one thread."""
-        here = versions() | self.origin() | {"code": code_digest(SHOWING)}
+        here = versions() | self.origin() | {"code": code_digest(SHOWING_ROOMS)}
         if other := next((name for name, value in self.there.items() if here.get(name) != value), ""):
             who = f"worker {os.getpid()} on {os.uname().nodename}"
             return Outcome(job, error=f"scheduler: {who} has another {other} than this process", fatal=True)

@@ -22,14 +22,14 @@ import xarray as xr
 from mrctl.control.features import FEATURES, feature_scale
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import PLANTS as SHARED
-from mrctl.experiments.mission_suite import ROOMY, SHAPE, TIE, Mode, drawn
+from mrctl.experiments.mission_suite import ROOMY_FACTOR, SHAPE, TIE, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
 from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import reached
 from mrctl.navigation.plan import Plan
-from mrctl.navigation.planning import PATIENCE, SLIM, planned
+from mrctl.navigation.planning import PATIENCE, REPLAN_MARGIN, planned
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
@@ -40,11 +40,11 @@ from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
-from mrctl.theory.timing import RESERVE, Limits
+from mrctl.theory.timing import LIMIT_SHARE, Limits
 
 PLANTS: dict[str, Perturbation] = {**SHARED, "mass +50 %": PERTURBATIONS["mass +50 %"]}
 DRAWS = {"quick": 6, "core": 40}
-PACE = 50  # simulated s in a s of one core, planning included
+SIMULATED_PER_SECOND = 50  # simulated s in a s of one core, planning included
 LIMITS = ("nominal", "learned")
 
 
@@ -84,11 +84,13 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     """
     count = DRAWS[mode]
     vehicle = Vehicle.of(base)
-    width, speed = ROOMY * vehicle.width, RESERVE * vehicle.robot.max_speed
+    width, speed = ROOMY_FACTOR * vehicle.width, LIMIT_SHARE * vehicle.robot.max_speed
     complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
     draws = drawn(partial(draw, vehicle, width, speed), count, complaint)
     left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
-    expected = journal.expected(left * sum(one.reference.period for one in draws) / PACE, left // (1 + len(LIMITS)))
+    expected = journal.expected(
+        left * sum(one.reference.period for one in draws) / SIMULATED_PER_SECOND, left // (1 + len(LIMITS))
+    )
     print(f"{left * count} runs with nominal and with learned limits, {expected}", flush=True)
     own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     parts = [
@@ -105,7 +107,7 @@ def draw(vehicle: Vehicle, width: float, speed: float, seed: int) -> Draw | None
     """Makes a corridor and plans a way through it; None where there is no way."""
     task = corridor(width, seed, **SHAPE)
     with suppress(InputError):
-        return Draw(seed, *planned(task, vehicle, speed, SLIM), task.goal)
+        return Draw(seed, *planned(task, vehicle, speed, REPLAN_MARGIN), task.goal)
 
 
 def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float, threads: int) -> dict[str, list[Run]]:

@@ -37,7 +37,7 @@ from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Waypoints
-from mrctl.theory.timing import RESERVE, Limits
+from mrctl.theory.timing import LIMIT_SHARE, Limits
 
 CONTROLLERS: tuple[FeedforwardName, ...] = ("none", "model", "fel", "model+composite")
 PLANTS: dict[str, Perturbation] = {
@@ -45,18 +45,19 @@ PLANTS: dict[str, Perturbation] = {
     "all": PERTURBATIONS["all"],
     "sagging battery": HARD["sagging battery"],
 }
-SPEEDS = (0.3, 0.45, 0.6, 0.75, RESERVE)  # over the robot's largest
+SPEEDS = (0.3, 0.45, 0.6, 0.75, LIMIT_SHARE)  # over the robot's largest
 SHAPE: dict[str, Any] = {"pieces": 3, "length": 2.0, "turn": np.pi / 4}  # of the corridors, in m and rad
-ROOMY = 1.5  # width of the corridor of a plan over that of the robot
-MARGINS = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the plan, over half of the rest; the largest that it can keep
+ROOMY_FACTOR = 1.5  # width of the corridor of a plan over that of the robot
+# of the plan, over half of the rest; the largest that it can keep
+PLAN_MARGINS = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
 MAP_ERROR = 0.01  # m, standard deviation of the offset of a corridor from its place on the map; chosen
-SLACK = 0.005  # m, the allowance for the critical speed; chosen
-MOST = 10  # worlds that are made, over the number of draws
-SHARE = 0.95
+ALLOWANCE = 0.005  # m, the allowance for the critical speed; chosen
+MAX_WORLDS_PER_DRAW = 10  # worlds that are made, over the number of draws
+CRITICAL_SHARE = 0.95
 DRAWS = {"quick": 20, "core": 80}  # with fewer than 72 the interval of a critical width has no upper end
-EVERY = 2  # control periods between the poses whose widths are looked at
+POSE_STRIDE = 2  # control periods between the poses whose widths are looked at
 TIE = 1e-3  # m
-PACE = 100  # simulated s in a s of one core, planning included
+SIMULATED_PER_SECOND = 100  # simulated s in a s of one core, planning included
 
 
 Mode = Literal["quick", "core"]
@@ -119,14 +120,18 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     """
     count = DRAWS[mode]
     vehicle = Vehicle.of(base)
-    width = ROOMY * vehicle.width
+    width = ROOMY_FACTOR * vehicle.width
     speeds = [share * vehicle.robot.max_speed for share in SPEEDS]
     complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
     draws = drawn(lambda seed: draw(vehicle, seed, width, speeds), count, complaint)
     every = [Series(name, k) for name in CONTROLLERS for k in range(len(SPEEDS))]
     every += [Series(name, len(SPEEDS) - 1, posture_known=True) for name in CONTROLLERS]
     left = [series for series in every if series.key not in journal]
-    seconds = sum(one.references[series.speed].period for series in left for one in draws) * len(PLANTS) / PACE
+    seconds = (
+        sum(one.references[series.speed].period for series in left for one in draws)
+        * len(PLANTS)
+        / SIMULATED_PER_SECOND
+    )
     print(f"{count * len(PLANTS) * len(left):,} runs, {journal.expected(seconds, len(left))}", flush=True)
     size = len(CONTROLLERS), len(PLANTS), count
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
@@ -154,9 +159,9 @@ def drawn(make: Callable[[int], T | None], count: int, complaint: str) -> list[T
         complaint: Message of the error.
 
     Raises:
-        InputError: `MOST` times as many seeds give too few draws.
+        InputError: `MAX_WORLDS_PER_DRAW` times as many seeds give too few draws.
     """
-    found = list(islice(filter(None, map(make, range(MOST * count))), count))
+    found = list(islice(filter(None, map(make, range(MAX_WORLDS_PER_DRAW * count))), count))
     if len(found) < count:
         raise InputError(complaint)
     return found
@@ -175,8 +180,8 @@ def draw(vehicle: Vehicle, seed: int, width: float, speeds: Sequence[float]) -> 
         The draw, or None where no plan goes through the corridor.
     """
     limits = Limits.of(vehicle.robot)
-    task, rest = corridor(width, seed, **SHAPE), width * (1 - 1 / ROOMY)
-    for share in MARGINS:
+    task, rest = corridor(width, seed, **SHAPE), width * (1 - 1 / ROOMY_FACTOR)
+    for share in PLAN_MARGINS:
         try:
             found, fastest = planned(task, vehicle, speeds[-1], share * rest / 2)
         except InputError:
@@ -216,8 +221,8 @@ def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
     for row in range(len(pose)):
         one, driven = draws[row % len(draws)], np.flatnonzero(np.isfinite(v[row]))
         if failure[row] == "" and arrived(pose[row, driven[-1]], v[row, driven[-1]], np.array(one.goal)):
-            own = pose[row, driven[::EVERY]]
-            on_reference = wanted[row, driven[::EVERY]] + own - seen[row, driven[::EVERY]]
+            own = pose[row, driven[::POSE_STRIDE]]
+            on_reference = wanted[row, driven[::POSE_STRIDE]] + own - seen[row, driven[::POSE_STRIDE]]
             aside = float(np.random.default_rng([one.seed, 2]).normal(0.0, MAP_ERROR))
             found[:, row] = [
                 corridor_width(corners, poses, one.seed, **SHAPE, aside=off)
@@ -268,7 +273,9 @@ def critical_widths(found: Found, shown: str) -> Table:
 
 def critical_speeds(found: Found, shown: str) -> Table:
     """Returns the table of the critical speeds."""
-    fits = np.cumprod(found.needed <= found.plans + SLACK, axis=0).sum(axis=0)  # how many speeds, from the slowest on
+    fits = np.cumprod(found.needed <= found.plans + ALLOWANCE, axis=0).sum(
+        axis=0
+    )  # how many speeds, from the slowest on
     critical, rows = np.array([0.0, *found.speeds])[fits], []
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):
@@ -279,7 +286,7 @@ def critical_speeds(found: Found, shown: str) -> Table:
         f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
         f"In paired draws, with 95 % confidence: {_against('none', -critical)}; {_against('model', -critical)}."
     )
-    return Table(f"Critical speed with an allowance of {1e3 * SLACK:.0f} mm ({shown})", says, frame(rows, header))
+    return Table(f"Critical speed with an allowance of {1e3 * ALLOWANCE:.0f} mm ({shown})", says, frame(rows, header))
 
 
 def budget(found: Found, shown: str) -> Table:
@@ -290,7 +297,7 @@ def budget(found: Found, shown: str) -> Table:
             every = found.map_off[c, p], found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
             parts = [needed - found.plans for needed in every]
             rows.append([plant, titled(name), *(_quantile(part, 1e3) for part in parts)])
-            value = [quantile_interval(part, SHARE).value for part in parts]
+            value = [quantile_interval(part, CRITICAL_SHARE).value for part in parts]
             if plant == "nominal" and np.isfinite(value).all():
                 off, right, *others = (1e3 * v for v in value)
                 gains[titled(name)] = ", ".join(f"{v:.1f}" for v in (off - right, *(right - v for v in others)))
@@ -312,8 +319,8 @@ def budget(found: Found, shown: str) -> Table:
 
 
 def _quantile(samples: Array, scale: float) -> str:
-    """Returns the quantile at `SHARE` times the scale, with its interval; the scale of negated samples is negative."""
-    value, low, high, *_ = quantile_interval(samples, SHARE)
+    """Returns the quantile at `CRITICAL_SHARE` times the scale, with its interval; negated samples: a negated scale."""
+    value, low, high, *_ = quantile_interval(samples, CRITICAL_SHARE)
     low, high = sorted((scale * low, scale * high))
     return f"{_text(scale * value)} [{_text(low)}, {_text(high)}]"
 

@@ -31,13 +31,13 @@ from mrctl.theory.perturbation import PERTURBATIONS
 from mrctl.theory.references import Lemniscate
 
 CASE = "all"  # plant of the figures, with another mass, supply, drive friction and resistance than the model
-LATE = "delay 20 ms"  # plant whose motors act later than the controllers know
+LATE_CASE = "delay 20 ms"  # plant whose motors act later than the controllers know
 PAPER: tuple[FeedforwardName, ...] = (
     "none", "model", "true_model", "model+observer", "fel", "model+fel", "model+rls", "model+composite",
 )  # fmt: skip
 FAST, SLOW = 12.0, 20.0  # s a lap
 DRAWS = 4  # number of replicates in each sensing tier
-LONG = 60  # number of laps that shows whether learning stays stable
+MANY_LAPS = 60  # number of laps that shows whether learning stays stable
 IDEAL: dict[str, Any] = {
     "sensing": Sensing(tier="ideal"),
     "pid": Pid(time_constant=0.15),
@@ -81,7 +81,7 @@ def real(tier: Tier) -> list[tuple[str, Scenario]]:
         The names of the feedforwards in the table, with their runs.
     """
     found = []
-    for case in ("nominal", CASE, LATE):
+    for case in ("nominal", CASE, LATE_CASE):
         for name, feedforward in REAL.items():
             fields = {"sensing": Sensing(tier=tier), "perturbation": PERTURBATIONS[case], **feedforward}
             found += [(name, one) for one in replicates(Scenario(name=case, **fields), DRAWS)]
@@ -116,7 +116,7 @@ def reproduce(out: Path) -> str:
     with output_folder(out):
         scenarios = benchmark()
         result = simulate(scenarios, progress=True)
-    endurance = [scenario("fel", case, laps=LONG) for case in ("nominal", CASE)]
+    endurance = [scenario("fel", case, laps=MANY_LAPS) for case in ("nominal", CASE)]
     endured = simulate(endurance, progress=True)
     figures(result, scenarios, out)
     lateral = kanayama.table()
@@ -225,11 +225,11 @@ def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, 
 
 def endurance_text(rows: Sequence[dict[str, Any]]) -> str:
     """Returns the table of the long runs as Markdown."""
-    header = ["run", *(f"{name}, lap 8 → {LONG}" for name in ("V, mm/s", "θ̇, mrad/s", "position, mm"))]
+    header = ["run", *(f"{name}, lap 8 → {MANY_LAPS}" for name in ("V, mm/s", "θ̇, mrad/s", "position, mm"))]
     cells = [
         [r["run"], *(" → ".join(number(1e3 * r[m][lap]) for lap in ("lap_8", "last")) for m in METRICS)] for r in rows
     ]
-    return f"The same after {LONG} laps:\n\n" + markdown(header, cells)
+    return f"The same after {MANY_LAPS} laps:\n\n" + markdown(header, cells)
 
 
 def text(rows: Sequence[dict[str, Any]]) -> str:

@@ -19,7 +19,7 @@ from mrctl.control.feedforward import Prior
 from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choice, Choices, Outcome
+from mrctl.experiments.cases import RECOVERED_RATIO, REFERENCES, SLOW, Choice, Choices, Outcome
 from mrctl.experiments.suite_tables import NO_CLAIM, titled, verdict
 from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
@@ -29,9 +29,9 @@ from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
 from mrctl.scenario import MODEL_BASED, Scenario, named
 
-MAPLESS = ("none", "model", *REFERENCES, *(f"model+{name}" for name in MODEL_BASED))
+WITHOUT_MAP = ("none", "model", *REFERENCES, *(f"model+{name}" for name in MODEL_BASED))
 """Feedforwards that learn no map from motion to voltage."""
-GRID = 41  # points along each side of a heat map
+GRID_POINTS = 41  # points along each side of a heat map
 TEMPLATE = Path(__file__).with_name("report.html")
 
 
@@ -102,7 +102,7 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
             "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve ends "
             "below 1 by the share of runs that it or PID alone lost.",
         )
-    learners = [name for name in choices if name not in MAPLESS]
+    learners = [name for name in choices if name not in WITHOUT_MAP]
     if learners:
         drawn["inverse_dynamics"] = (
             plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
@@ -128,7 +128,7 @@ def learned(choice: Choice, scenario: Scenario) -> InverseMap:
         simulation.step()
     lap = simulation.log.ticks[-round(scenario.reference.period / scenario.control_period) :, 0]
     path = np.stack([lap["v_command"], lap["omega_command"]], axis=1)
-    v, omega, shape = np.linspace(0, 1.2, GRID), np.linspace(-2, 2, GRID), (GRID, GRID, 2)
+    v, omega, shape = np.linspace(0, 1.2, GRID_POINTS), np.linspace(-2, 2, GRID_POINTS), (GRID_POINTS, GRID_POINTS, 2)
     truth = Prior([simulation.plant.truth[0]], rigid=simulation.scenarios[0].steering == "rigid")
     mine, true = (
         np.reshape([np.array(law(np.array([[x, y]]), np.zeros((1, 2))))[0] for y in omega for x in v], shape)
@@ -161,7 +161,7 @@ def page(
         random=random,
         feedforwards=list(choices),
         aside=outcome.aside,
-        band=f"{BAND:g}",
+        band=f"{RECOVERED_RATIO:g}",
         mode=outcome.mode,
         says={table.title: table.says for table in tables},
         reads={table.title: table.reads for table in tables},
@@ -220,7 +220,7 @@ def recoveries(outcome: Outcome) -> str:
             lost = f", {row['failed']} failed" if row["failed"] else ""
             text = f"{mean}{number(after)}×, {number(back)}×{lost}"
             bold = error["recovered_within_one_lap"] == 1
-            cells.setdefault(case, {})[row["feedforward"]] = Cell(text, after / BAND, bold)
+            cells.setdefault(case, {})[row["feedforward"]] = Cell(text, after / RECOVERED_RATIO, bold)
     return _coloured("recoveries", cells)
 
 

@@ -18,9 +18,9 @@ from scipy.interpolate import CubicSpline
 
 from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.control.guard import Guard
-from mrctl.control.matching import LAG
+from mrctl.control.matching import HOLD_PERIODS
 from mrctl.kernel import Array
-from mrctl.loop.hierarchy import TAKE_OVER
+from mrctl.loop.hierarchy import HAND_OVER_SHARE
 from mrctl.loop.simulation import Simulation, arranged
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
@@ -28,7 +28,7 @@ from mrctl.theory.references import Line
 
 Response = NDArray[np.complex128]
 
-SAMPLES = 1000  # control periods in a period of the excitation
+PERIOD_TICKS = 1000  # control periods in a period of the excitation
 AMPLITUDE = 0.03  # V at each frequency, times `STEERING_SCALE` in rad/s for steering: no tyre slides, no wheel reverses
 
 
@@ -107,23 +107,23 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
         InputError: A robot failed.
     """
     first = arranged(scenarios[0])
-    harmonics = lines(SAMPLES)
-    signal = np.zeros((SAMPLES, 2))
+    harmonics = lines(PERIOD_TICKS)
+    signal = np.zeros((PERIOD_TICKS, 2))
     scale = STEERING_SCALE if channel == 1 and first.steering == "rigid" else 1.0
-    signal[:, channel] = AMPLITUDE * scale * multisine(SAMPLES, harmonics)
-    duration = 2 * SAMPLES * first.control_period  # one period to settle, one to measure
+    signal[:, channel] = AMPLITUDE * scale * multisine(PERIOD_TICKS, harmonics)
+    duration = 2 * PERIOD_TICKS * first.control_period  # one period to settle, one to measure
     line = Line(length=speed * duration, speed=speed)
     steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "guard": Guard(on=False)}
     steady |= FEEDFORWARDS["none"]
     runs = [s.model_copy(update=steady | {"pid": s.pid.model_copy(update={"retune": False})}) for s in scenarios]
-    shaker = Shaker(signal, 2 * SAMPLES, len(runs))
+    shaker = Shaker(signal, 2 * PERIOD_TICKS, len(runs))
     simulation = Simulation(runs, feedforward=lambda robot, size: shaker)
     while simulation.running:
         simulation.step()
     for row in np.flatnonzero(simulation.plant.failed):
         raise InputError(f"world: no response on {line.length:g} m of it: {simulation.plant.failure[row]}")
-    response = -estimate(signal[:, channel], shaker.feedback[SAMPLES:, :, channel], harmonics)
-    return 2 * np.pi / (SAMPLES * first.control_period) * harmonics.astype(float), response
+    response = -estimate(signal[:, channel], shaker.feedback[PERIOD_TICKS:, :, channel], harmonics)
+    return 2 * np.pi / (PERIOD_TICKS * first.control_period) * harmonics.astype(float), response
 
 
 def refine(frequency: Array, response: Response) -> tuple[Array, Response]:
@@ -164,8 +164,8 @@ def safety(frequency: Array, response: Response, period: float, delay: float = 0
         period: Control period h in s.
         delay: Delay d h of the loop in s that the learner knows; τ = (d + 2) h.
     """
-    handed_over = TAKE_OVER + (1 - TAKE_OVER) * response
-    early = np.exp(1j * frequency * (delay + LAG * period))
+    handed_over = HAND_OVER_SHARE + (1 - HAND_OVER_SHARE) * response
+    early = np.exp(1j * frequency * (delay + HOLD_PERIODS * period))
     return Safety(
         positive_to=_positive_to(frequency, response),
         lowest=float(response.real.min()),

@@ -26,7 +26,7 @@ from mrctl.experiments import bench as benchmark
 from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import REPLICATES
-from mrctl.experiments.held_out import LOG
+from mrctl.experiments.held_out import LOG_FILE
 from mrctl.experiments.suite_tables import COLUMNS, column_title, interval, titled
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.record import InputError
@@ -315,7 +315,7 @@ def _random_section(folder: Path) -> str:
 
 def _held_out_section(folder: Path) -> str:
     table = _read(folder / "table.json", "cells", "entry")
-    text = held_out_text(_text(folder / "table.md"), _text(folder / LOG))
+    text = held_out_text(_text(folder / "table.md"), _text(folder / LOG_FILE))
     return _section(f"mrctl suite --held-out {table['entry']}", table, text)
 
 

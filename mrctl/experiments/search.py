@@ -13,10 +13,11 @@ exp J is a weighted geometric mean of ratios. In a mean of logarithms every worl
 whatever the size of the error; in a mean of errors the hardest world would decide alone. Position counts as much as
 both velocities: it is what a user sees, and the velocities are what a learner acts on. All laps count, so that a
 setting pays for learning slowly. To each error a floor is added, below which a difference means nothing to a user
-(`FLOORS`). A run that fails counts as `LOST` times the error of `model`, and none counts as more: one loss among 16
-worlds costs as much as 15 % of the error in all of them. In two of the eight kinds of worlds the motors act 10 ms later
-than the controller knows, in one of these with a light robot; this keeps settings off the edge of stability. With 20
-ms, which PID alone bears in `lab`, the search slows a learner down until it corrects little: the observer to T = 3.2 s.
+(`ERROR_FLOORS`). A run that fails counts as `MAX_RATIO` times the error of `model`, and none counts as more: one loss
+among 16 worlds costs as much as 15 % of the error in all of them. In two of the eight kinds of worlds the motors act 10
+ms later than the controller knows, in one of these with a light robot; this keeps settings off the edge of stability.
+With 20 ms, which PID alone bears in `lab`, the search slows a learner down until it corrects little: the observer to T
+= 3.2 s.
 
 **Search.** CMA-ES (Hansen 2016, arXiv:1604.00772) searches in the logarithm of the settings, from the shipped ones on,
 in the same worlds in each generation. The shipped settings are a candidate too, so that the result is never worse
@@ -38,7 +39,7 @@ from cmaes import CMA
 from tqdm import tqdm
 
 from mrctl.control.stages import Stages
-from mrctl.experiments.cases import GRIP, MARGIN, TUNING_SEEDS, slowed
+from mrctl.experiments.cases import LIMIT_SHARE, RELIED_FRICTION, TUNING_SEEDS, slowed
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
 from mrctl.kernel import Array
@@ -82,13 +83,18 @@ SEARCHED: dict[str, Bounds] = {
 """Settings to search, with their bounds, by learner: those that determine how fast and how far it follows an error.
 Constants that change no dynamics (units, scales, bounds of weights) and filters that several laws share stay fixed."""
 METRICS = {"position_rmse": 0.5, "v_rmse": 0.25, "omega_rmse": 0.25}  # weights in the objective
-FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s, added to the errors; half the physics step changes these by less
-LOST = 10.0  # largest ratio of an error to that of `model`, and that of a failed run
-PERIOD, LAPS = 12.0, 2  # lap time of the splines in s and number of laps, which all robots of a batch share
-SPREAD = 0.2  # standard deviation of the first generation, as a share of the logarithmic range
-TUNING = TUNING_SEEDS.start  # first seed of the worlds that the search sees
-FRESH = TUNING + 50_000  # first seed of the worlds that it does not see
-NOISY = {"encoder_counts": 0.5, "gyro_noise": 4.0, "fix_position_noise": 2.0, "fix_heading_noise": 2.0}  # factors
+ERROR_FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s, added to the errors; half the physics step changes these by less
+MAX_RATIO = 10.0  # largest ratio of an error to that of `model`, and that of a failed run
+LAP_TIME, LAPS = 12.0, 2  # lap time of the splines in s and number of laps, which all robots of a batch share
+START_DEVIATION = 0.2  # standard deviation of the first generation, as a share of the logarithmic range
+FIRST_TUNING_SEED = TUNING_SEEDS.start  # first seed of the worlds that the search sees
+FIRST_FRESH_SEED = FIRST_TUNING_SEED + 50_000  # first seed of the worlds that it does not see
+NOISE_FACTORS = {
+    "encoder_counts": 0.5,
+    "gyro_noise": 4.0,
+    "fix_position_noise": 2.0,
+    "fix_heading_noise": 2.0,
+}  # factors
 KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
     "as built": lambda r: {},
     "heavy": lambda r: {"perturbation": {"mass_factor": r.uniform(1.25, 1.75)}},
@@ -101,11 +107,11 @@ KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
         },
     },
     "payload at half time": lambda r: {
-        "events": [{"time": PERIOD * LAPS / 2, "perturbation": {
+        "events": [{"time": LAP_TIME * LAPS / 2, "perturbation": {
             "payload": r.uniform(2, 6), "payload_x": r.uniform(-0.1, 0.3), "payload_y": r.uniform(-0.1, 0.1),
         }}],
     },
-    "noise": lambda r: {"sensing": NOISY},
+    "noise": lambda r: {"sensing": NOISE_FACTORS},
     "late": lambda r: {"perturbation": {"control_delay": 0.01}},
 }  # fmt: skip
 """Kinds of plants, as fields of a scenario to draw; the values of `sensing` are factors on those of the tier."""
@@ -221,7 +227,7 @@ class Worlds(NamedTuple):
 
 def worlds(tier: Tier, budget: Budget) -> Worlds:
     """Draws the worlds of a tier; each is a pure function of tier and seed."""
-    first = {TUNING: budget.worlds, FRESH: budget.fresh}
+    first = {FIRST_TUNING_SEED: budget.worlds, FIRST_FRESH_SEED: budget.fresh}
     return Worlds(*([world(tier, seed) for seed in range(start, start + count)] for start, count in first.items()))
 
 
@@ -247,10 +253,10 @@ def world(tier: Tier, seed: int) -> Scenario:
 def _course(seed: int) -> Waypoints:
     """Draws a random spline with the margins of those in the suite, slowed down to the lap time."""
     random, robot = np.random.default_rng([seed, 8]), read_robot(mjcf.load())
-    careful = robot.model_copy(update={"tyre_friction": GRIP / MARGIN})
-    while (course := random_spline(random, careful, MARGIN, MARGIN)).period > PERIOD:
+    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / LIMIT_SHARE})
+    while (course := random_spline(random, careful, LIMIT_SHARE, LIMIT_SHARE)).period > LAP_TIME:
         pass
-    return slowed(course, PERIOD)
+    return slowed(course, LAP_TIME)
 
 
 def score(errors: Array, yardstick: Array) -> Array:
@@ -264,8 +270,10 @@ def score(errors: Array, yardstick: Array) -> Array:
     """
     known = np.isfinite(yardstick).all(axis=1)
     errors, yardstick = errors[known], yardstick[known]
-    ratio = np.nan_to_num((errors + FLOORS) / (yardstick + np.array(FLOORS)), nan=LOST, posinf=LOST)
-    return np.log(np.minimum(ratio, LOST)) @ np.array(list(METRICS.values()))
+    ratio = np.nan_to_num(
+        (errors + ERROR_FLOORS) / (yardstick + np.array(ERROR_FLOORS)), nan=MAX_RATIO, posinf=MAX_RATIO
+    )
+    return np.log(np.minimum(ratio, MAX_RATIO)) @ np.array(list(METRICS.values()))
 
 
 class Memory:
@@ -355,7 +363,7 @@ def find(searched: Entry, tier: Tier, memory: Memory, among: Sequence[Scenario],
     low, span = limits[:, 0], np.log(limits[:, 1] / limits[:, 0])
     start = np.log(np.clip(list(searched.shipped.values()), limits[:, 0], limits[:, 1]) / low) / span
     unit = np.tile([0.0, 1.0], (len(low), 1))
-    optimiser = CMA(start, SPREAD, unit, seed=TUNING, population_size=budget.population)
+    optimiser = CMA(start, START_DEVIATION, unit, seed=FIRST_TUNING_SEED, population_size=budget.population)
     tried: list[tuple[float, dict[str, float]]] = []
 
     def judge(settings: list[dict[str, float]]) -> list[float]:
@@ -375,7 +383,7 @@ def find(searched: Entry, tier: Tier, memory: Memory, among: Sequence[Scenario],
             bar.set_postfix(error=f"{np.exp(min(tried, key=_value)[0]):.4f} of model's")
     best, found = min(tried, key=_value)  # the first of equal ones
     origin = f"mrctl {versions()['mrctl']}, tune --search {searched.title}, {tier}: best of {len(tried)} settings "
-    origin += f"in {budget.worlds} worlds with seeds from {TUNING}"
+    origin += f"in {budget.worlds} worlds with seeds from {FIRST_TUNING_SEED}"
     return {"found": found, "objective": {"shipped": tried[0][0], "found": best}, "origin": origin}
 
 

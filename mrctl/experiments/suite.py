@@ -14,13 +14,13 @@ import xarray as xr
 
 from mrctl.experiments import report
 from mrctl.experiments.cases import (
-    BAND,
     FLOOR,
     HALF,
     HINDSIGHT,
     MUCH_WORSE,
     NO_WORSE,
     PARTS,
+    RECOVERED_RATIO,
     SUITE_SEEDS,
     UNCHANGED,
     Case,
@@ -49,8 +49,9 @@ from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
 Errors = Mapping[str, Mapping[str, Array]]
-CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
-STARTING, STATISTICS = 3.0, 0.15  # s for the start of a feedforward's workers, and for a row of the tables; measured
+RUNS_PER_JOB = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
+# s for the start of a feedforward's workers, and for a row of the tables; measured
+START_SECONDS, ROW_SECONDS = 3.0, 0.15
 
 
 def suite(
@@ -134,7 +135,7 @@ def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path
     laps, aside = {}, []
     for place, (name, choice) in enumerate(choices.items(), 1):
         scenarios = [s.model_copy(update=choice.pair) for case in chosen for s in case.scenarios]
-        chunk = min(CHUNK, -(-len(scenarios) // 4))
+        chunk = min(RUNS_PER_JOB, -(-len(scenarios) // 4))
         own = {"controller": choice.controller, "hindsight": name == HINDSIGHT}
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, **own)
         print(f"{name} ({place} of {len(choices)})", file=sys.stderr)
@@ -153,8 +154,8 @@ def expectation(chosen: Sequence[Case], choices: Choices, workers: int, out: Pat
     seconds = sum(s.duration * usual / s.physics_step for s in scenarios)
     shares = {name: left(out / name) for name in choices}
     drives = sum((1 + REPETITIONS if name == HINDSIGHT else 1) * share for name, share in shares.items())
-    wait = drives * seconds / pace() / workers + STARTING * sum(share > 0 for share in shares.values())
-    wait += STATISTICS * len(chosen) * len(choices)
+    wait = drives * seconds / pace() / workers + START_SECONDS * sum(share > 0 for share in shares.values())
+    wait += ROW_SECONDS * len(chosen) * len(choices)
     done = 1 - sum(shares.values()) / len(shares)
     return (
         f"{len(scenarios) * len(choices):,} runs, {done:.0%} of them done; "
@@ -173,7 +174,7 @@ def left(path: Path) -> float:
 
 def pace() -> float:
     """Measures the simulated seconds that one core drives in a second, metrics included, on a short drive."""
-    batch = replicates(Scenario(laps=1, reference=Circle(period=4.0, radius=0.5), prior="model"), CHUNK)
+    batch = replicates(Scenario(laps=1, reference=Circle(period=4.0, radius=0.5), prior="model"), RUNS_PER_JOB)
     metrics.per_lap(simulate(batch[:1], threads=1))  # compiles or loads the kernels
     began = time.perf_counter()
     metrics.per_lap(simulate(batch, threads=1))
@@ -202,7 +203,7 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
     (infinite where a run failed) and the ratios to PID and to `model`. `excess` is the error beyond that of the last
     lap (after a step: of the lap before the return), integrated from the start or the step on; it has no meaning where
     the course changes. Where nothing changes during a run, a row holds the number of laps until the error stays within
-    `BAND` times its final value; for a step it holds what `_step` returns.
+    `RECOVERED_RATIO` times its final value; for a step it holds what `_step` returns.
     """
     pairs = [(found[plant], found[plant + HALF]) for plant in FLOOR if {plant, plant + HALF} <= found.keys()]
     limits = {metric: floors(pairs, metric) for metric in COLUMNS}
@@ -259,7 +260,7 @@ def _statistics(
         integral = metrics.excess(own, metric, case.change or 1, until).values
         found["excess"] = bootstrap_interval(integral)._asdict()
     if case.part in UNCHANGED:
-        laps = metrics.laps_to_converge(own, metric, BAND).values
+        laps = metrics.laps_to_converge(own, metric, RECOVERED_RATIO).values
         found["laps_to_converge"] = bootstrap_interval(laps)._asdict()
     if case.back:
         found |= _step(own, metric, case)
@@ -353,7 +354,7 @@ def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
     after = {"in_first_lap": case.change, "after_one_lap": case.change + 1}
     after |= {"return_first_lap": case.back, "return_after_one_lap": case.back + 1}
     found: dict[str, Any] = {name: paired_ratio(error[:, lap - 1], before)._asdict() for name, lap in after.items()}
-    needed = metrics.recovery_laps(laps, metric, case.change, case.back - 1, BAND).values
+    needed = metrics.recovery_laps(laps, metric, case.change, case.back - 1, RECOVERED_RATIO).values
     worst = {f"{name}_worst": cvar(error[:, lap - 1] / before) for name, lap in after.items()}
     found["after_one_lap_to_settled"] = paired_ratio(error[:, case.change], settled)._asdict()
     found["during"] = bootstrap_interval(settled)._asdict()

@@ -9,8 +9,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, MUCH_WORSE, NO_WORSE, PARTS, REFERENCES, UNCHANGED
-from mrctl.experiments.tables import LEAST, Table, number
+from mrctl.experiments.cases import (
+    FLOOR,
+    HALF,
+    HINDSIGHT,
+    MUCH_WORSE,
+    NO_WORSE,
+    PARTS,
+    RECOVERED_RATIO,
+    REFERENCES,
+    UNCHANGED,
+)
+from mrctl.experiments.tables import MIN_PAIRS, Table, number
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 TITLES = {"none": "PID"}  # names of feedforwards in the tables, where these differ
@@ -25,7 +35,7 @@ LEADING = {
 }
 WON = "share of runs below {}: V / θ̇ / position [interval of position]"
 HARMLESS = f"share of runs at most {NO_WORSE:g}× PID: V / θ̇ / position [interval of position]"
-CONVERGED = f"laps to {BAND:g}× the final V / θ̇ / position"
+CONVERGED = f"laps to {RECOVERED_RATIO:g}× the final V / θ̇ / position"
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
 
 Row = dict[str, Any]
@@ -39,7 +49,7 @@ def tables(rows: Sequence[Row], mode: str) -> list[Table]:
         mode: Size of the suite.
     """
     found = []
-    few = mode == "quick" or all(row["runs"] < LEAST for row in rows)
+    few = mode == "quick" or all(row["runs"] < MIN_PAIRS for row in rows)
 
     def add(title: str, says: str, cells: pd.DataFrame, reads: str = "") -> None:
         found.append(Table(f"{title} ({mode})", NO_CLAIM if few else says, cells, reads))
@@ -172,7 +182,9 @@ def reading(header: Sequence[str]) -> str:
             f"of runs in which it is above {MUCH_WORSE:g}."
         )
     if CONVERGED in header:
-        found.append(f"The last column counts laps until the error stays within {BAND:g} times its final value.")
+        found.append(
+            f"The last column counts laps until the error stays within {RECOVERED_RATIO:g} times its final value."
+        )
     return " ".join(found)
 
 
@@ -254,8 +266,8 @@ def recovered(rows: Sequence[Row]) -> str:
     steps = len({row["case"] for row in rows})
     listed = _counted(counts)
     return (
-        f"Of {steps} step{'s' * (steps > 1)}, one lap later the position error of every run is back within {BAND:g} "
-        f"times that before it {'with ' + listed if listed else 'with no feedforward in any'}."
+        f"Of {steps} step{'s' * (steps > 1)}, one lap later the position error of every run is back within "
+        f"{RECOVERED_RATIO:g} times that before it {'with ' + listed if listed else 'with no feedforward in any'}."
     )
 
 

@@ -18,7 +18,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.comparison import Superiority, bootstrap_interval, wilson
 
-LEAST = 6  # pairs that one which always wins needs for 95 % confidence: the exact sign test gives p = 0.03
+MIN_PAIRS = 6  # pairs that one which always wins needs for 95 % confidence: the exact sign test gives p = 0.03
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -81,7 +81,7 @@ def wins_cell(wins: Superiority) -> str:
 
 def word_of(wins: Superiority, better: str, worse: str) -> str:
     """Returns the word for one that wins more than half of the pairs with confidence, for one that loses, or level."""
-    if wins.wins + wins.ties + wins.losses < LEAST:
+    if wins.wins + wins.ties + wins.losses < MIN_PAIRS:
         return "level"
     return better if wins.low > 0.5 else worse if wins.high < 0.5 else "level"
 

@@ -27,7 +27,7 @@ from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import outcomes
 from mrctl.navigation.plan import Plan
-from mrctl.navigation.planning import PATIENCE, PERIOD, prepared
+from mrctl.navigation.planning import PATIENCE, REACTIVE_PERIOD, prepared
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
@@ -35,7 +35,7 @@ from mrctl.results.metrics import control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Disc, Obstacles
 from mrctl.theory.references import Line
-from mrctl.theory.timing import RESERVE
+from mrctl.theory.timing import LIMIT_SHARE
 
 
 class Entry(NamedTuple):
@@ -55,10 +55,10 @@ FIRST, SECOND, THIRD = ENTRIES
 WORLDS = {"quick": 4, "core": 30}
 GATES, SPACING = 2, 2.0  # of the slalom; m
 CROSSINGS = (3.0, 5.0)  # m, where the discs cross the way, on average
-RADIUS = 0.2  # m, of the discs
-MOST_LAG = 1.0  # s
-PACE = 8  # simulated s in a s of one core
-TIE = PERIOD
+DISC_RADIUS = 0.2  # m, of the discs
+MAX_LAG = 1.0  # s
+SIMULATED_PER_SECOND = 8  # simulated s in a s of one core
+TIE = REACTIVE_PERIOD
 
 
 class World(NamedTuple):
@@ -104,7 +104,7 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     complaint = f"suite: {base.robot.path} finds no way through most slaloms"
     worlds = drawn(partial(world, base), count, complaint)
     left = sum([name, plant] not in journal for name in ENTRIES for plant in PLANTS)
-    seconds = left * sum(one.scenario.reference.period for one in worlds) / PACE
+    seconds = left * sum(one.scenario.reference.period for one in worlds) / SIMULATED_PER_SECOND
     print(f"{left * count} runs with MPPI, {journal.expected(seconds, 2 * len(PLANTS))}", flush=True)
     lag, driven = 0.0, {}
     for entries in (FIRST, THIRD), (SECOND,):  # the second needs the lag that fits the first
@@ -153,9 +153,9 @@ def world(base: Scenario, seed: int) -> World | None:
     for way in CROSSINGS:
         x, late = way + random.uniform(-0.5, 0.5), random.uniform(-0.5, 0.5)
         speed, heading = random.uniform(0.3, 0.9), random.choice([-1, 1]) * np.pi / 2 + random.uniform(-0.5, 0.5)
-        behind = speed * (x / (RESERVE * vehicle.robot.max_speed) + late)
+        behind = speed * (x / (LIMIT_SHARE * vehicle.robot.max_speed) + late)
         at = x * np.exp(-1j * heading) - behind  # as the disc counts, from the pose of its course
-        movers.append(Disc(x=at.real, y=at.imag, radius=RADIUS, course=Line(heading=heading, speed=speed)))
+        movers.append(Disc(x=at.real, y=at.imag, radius=DISC_RADIUS, course=Line(heading=heading, speed=speed)))
     task = Task(obstacles=Obstacles(shapes=(*still.obstacles.shapes, *movers)), start=still.start, goal=still.goal)
     try:
         plan, own = prepared(task, base, avoid="mppi")
@@ -180,7 +180,7 @@ def fitted(results: Sequence[xr.Dataset]) -> float:
                 now = wanted + left * (now - wanted)
         return total
 
-    return float(fminbound(missed, 1e-3, MOST_LAG))  # pyright: ignore[reportArgumentType] (without full_output one number)
+    return float(fminbound(missed, 1e-3, MAX_LAG))  # pyright: ignore[reportArgumentType] (without full_output one number)
 
 
 def ended(result: xr.Dataset, one: World) -> Run:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from tqdm import tqdm
 
-from mrctl.control.design import M_S, M_T, SPEEDS, plants, sensitivity
+from mrctl.control.design import M_S, M_T, SPEED_SHARES, plants, sensitivity
 from mrctl.control.design import motion as motion_design
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains, learning_ratio, margins, sampled_loop
@@ -49,14 +49,14 @@ SAFETY = {
     "built_in_to": "built-in learners safe to, rad/s",
     "step": "largest step",
 }
-GAINS = ("plant gain", "plant lag, s", "K_p", "K_i", "learning ratio")
+GAIN_COLUMNS = ("plant gain", "plant lag, s", "K_p", "K_i", "learning ratio")
 UNITS = """\
 Units: common m/s, V/(m/s), V/m; second rad/s, V/(rad/s), V/rad; of rigid steering 1, 1, 1/s. Learning without delay and
 hold converges with a first-order plant if the ratio K_p (1 + K K_p)/(τ K_i) is above 1."""
 GAINS_UNITS = """\
 Units of K_p and K_i: common V/(m/s), V/m; second V/(rad/s), V/rad; of rigid steering 1, 1/s. Each tier is beside the
 delay of its loop, for which its runs design the PID."""
-MOTION = (
+MOTION_COLUMNS = (
     *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
     *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "max \\|S\\| second"),
 )
@@ -141,7 +141,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
         channels = (0, 1) if steering == offered[0] else (1,)
         for channel in tqdm(channels, unit="loop", desc=steering):
             plant = plants(nominal, rigid, channel)[0]
-            frequency, measured = measure(scenarios, channel, SPEEDS[0] * nominal.max_speed)
+            frequency, measured = measure(scenarios, channel, SPEED_SHARES[0] * nominal.max_speed)
             for one, alone, whole in zip(designs, *np.split(measured, 2), strict=True):
                 loop = sampled_loop(frequency, plant, one.gains[channel], period, one.delay)
                 t = dict(zip(RESPONSES, (loop / (1 + loop), alone, whole), strict=True))
@@ -239,10 +239,10 @@ def text(table: dict[str, Any]) -> str:
     loops = ["loop", "delay, ms"]
     parts = [
         f"{_rule(table)}:",
-        markdown([*loops, *GAINS], gains),
+        markdown([*loops, *GAIN_COLUMNS], gains),
         UNITS,
         "The motion controller for these loops:",
-        markdown([*MOTION], motions),
+        markdown([*MOTION_COLUMNS], motions),
         SECOND_LOOP,
         f"{' / '.join(RESPONSES.values())}:",
         markdown([*loops, *MARGINS.values(), *SAFETY.values()], rows),
@@ -311,7 +311,7 @@ def figure(table: dict[str, Any]) -> Figure:
     marks = np.unique(np.geomspace(1, len(frequency), 30).astype(int) - 1).tolist()  # dots evenly spread
     rows, loops = table["responses"], list(dict.fromkeys(map(_name, table["responses"])))
     height = len(loops) // 2
-    drawn = Figure(figsize=(plots.PAGE, 0.35 * height * plots.PAGE + 0.5), layout="constrained")
+    drawn = Figure(figsize=(plots.PAGE_WIDTH, 0.35 * height * plots.PAGE_WIDTH + 0.5), layout="constrained")
     panels = list(drawn.subplots(height, 2, sharex=True, sharey=True).flat)
     for axes, name in zip(panels, loops, strict=True):
         axes.axhspan(-2, 0, color="0.93", zorder=0)

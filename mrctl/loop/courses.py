@@ -12,8 +12,8 @@ from mrctl.kernel import Array, Rows
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
-BLOCK = 10_000  # control ticks whose references are sampled at once
-FAR = 0.8  # m, largest distance between robot and reference at the start
+SAMPLED_TICKS = 10_000  # control ticks whose references are sampled at once
+MAX_START_DISTANCE = 0.8  # m, largest distance between robot and reference at the start
 
 GOAL = np.dtype(
     [
@@ -72,8 +72,8 @@ class Courses:
     def _sampled(self, tick: int) -> tuple[Rows, Rows]:
         """Returns what `at` returns."""
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
-            first = tick // BLOCK * BLOCK
-            self._block = range(first, min(first + BLOCK, self._ticks))
+            first = tick // SAMPLED_TICKS * SAMPLED_TICKS
+            self._block = range(first, min(first + SAMPLED_TICKS, self._ticks))
             whole = range(first, self._block.stop + self._preview)
             self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
         row = tick - self._block.start
@@ -125,9 +125,9 @@ def start_pose(scenario: Scenario, reference: Array) -> Array:
     base = reference if scenario.initial_pose is None else np.array(scenario.initial_pose)
     offset = np.random.default_rng([scenario.seed, 0]).standard_normal(3) * scenario.initial_spread
     distance = float(np.hypot(*(base + offset - reference)[:2]))
-    if distance > FAR:
+    if distance > MAX_START_DISTANCE:
         raise InputError(
             f"initial_pose: {distance:.2f} m from the start of the reference at "
-            f"({reference[0]:.2f}, {reference[1]:.2f}); at most {FAR:g} m"
+            f"({reference[0]:.2f}, {reference[1]:.2f}); at most {MAX_START_DISTANCE:g} m"
         )
     return base + offset

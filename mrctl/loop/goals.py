@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.scenario import Scenario
 
-NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
-HEADWAY, STUCK = 0.05, 5.0  # m and s: a robot that moves no farther than that within this time is stuck
+ARRIVAL_DISTANCE, ARRIVAL_ANGLE, ARRIVAL_SPEED = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
+STUCK_DISTANCE, STUCK_TIME = 0.05, 5.0  # m and s: a robot that moves no farther than that within this time is stuck
 
 ENDING = np.dtype(
     [
@@ -31,7 +31,11 @@ ENDING = np.dtype(
 @kernel
 def stands_at(x: float, y: float, turn: float, v: float) -> bool:
     """Tells whether a robot that is x and y in m and a turn in rad from its goal, with V in m/s, has arrived there."""
-    return np.hypot(x, y) < NEAR and abs(np.arctan2(np.sin(turn), np.cos(turn))) < TURNED and abs(v) < RESTING
+    return (
+        np.hypot(x, y) < ARRIVAL_DISTANCE
+        and abs(np.arctan2(np.sin(turn), np.cos(turn))) < ARRIVAL_ANGLE
+        and abs(v) < ARRIVAL_SPEED
+    )
 
 
 @kernel
@@ -47,7 +51,7 @@ def end(tick: int, patience: int, now: Rows, endings: Rows) -> bool:
     found = False
     for i in range(len(endings)):
         t, s = now[i], endings[i]
-        if np.hypot(t.x - s.place[0], t.y - s.place[1]) > HEADWAY:
+        if np.hypot(t.x - s.place[0], t.y - s.place[1]) > STUCK_DISTANCE:
             s.place[0], s.place[1], s.since = t.x, t.y, tick
         s.there = stands_at(t.x - s.goal[0], t.y - s.goal[1], t.theta - s.goal[2], t.v)
         s.over = s.there or tick + 1 - s.start >= s.ticks
@@ -57,7 +61,7 @@ def end(tick: int, patience: int, now: Rows, endings: Rows) -> bool:
 
 
 def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
-    """Tells which robots stand at their goals, within `NEAR`, `TURNED` and `RESTING`.
+    """Tells which robots stand at their goals, within `ARRIVAL_DISTANCE`, `ARRIVAL_ANGLE` and `ARRIVAL_SPEED`.
 
     Args:
         pose: x and y in m and θ in rad, `(…, 3)`.
@@ -95,7 +99,7 @@ class Goals:
         endings["ticks"] = np.where(timed & (ticks < ticks.max()), ticks, np.inf)  # of runs that end before the group
         endings["place"] = np.inf
         self.any, self.there = bool(np.isfinite(endings["goal"]).any()), endings["there"]
-        self._patience = round(STUCK / scenarios[0].control_period)
+        self._patience = round(STUCK_TIME / scenarios[0].control_period)
         self._end = end.repeated()
 
     def restart(self, row: int, tick: int) -> None:

@@ -19,7 +19,7 @@ from mrctl.control import guard as guarding
 from mrctl.control.delay import DELAY, watch_delay
 from mrctl.control.design import MotionDesign, motion
 from mrctl.control.feedforward import Learner, Loop, Prior, learn_nothing, nothing, prior_voltage
-from mrctl.control.guard import BACK_OFF, GUARD, UNSURE, guard
+from mrctl.control.guard import BACK_OFF, GUARD, NO_RESET_FACTOR, guard
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.learners import LEARNERS
 from mrctl.control.limiter import LIMITER, limit
@@ -35,11 +35,11 @@ from mrctl.sensing.scanner import Scanner
 from mrctl.theory.references import Reference
 from mrctl.theory.robot import Robot
 
-SLIPS = 0.1  # slip ratio above which the voltage does not explain the motion, and nothing is learned
+MAX_LEARNING_SLIP = 0.1  # slip ratio above which the voltage does not explain the motion, and nothing is learned
 # Share of the change of the feedforward by learning that the PID's integral gives up at once. With 0, both contain the
 # same voltage until the error has unwound the integral: the first lap overshoots, and the loop has one fast integrator
 # too many. With 1, learning has no integral action of its own, and the position is tracked less well.
-TAKE_OVER = 0.5
+HAND_OVER_SHARE = 0.5
 
 CONTROL = np.dtype(
     [
@@ -105,7 +105,7 @@ def apply_voltages(seen: Row, robot: Row, period: float, s: Row) -> bool:
     a = s.allocation
     allocate(s.limiter.command, s.feedback, s.guard.output, period, robot, a)
     take_loss(seen.lost, robot.rigid, a)
-    s.slips = not seen.slip <= SLIPS  # NaN counts as slip
+    s.slips = not seen.slip <= MAX_LEARNING_SLIP  # NaN counts as slip
     s.frozen = 1.0 if a.saturated or s.learning_off or s.guard.frozen or s.slips else 0.0
     finite = True
     for k in range(2):
@@ -116,14 +116,14 @@ def apply_voltages(seen: Row, robot: Row, period: float, s: Row) -> bool:
 
 @kernel
 def hand_over(s: Row) -> None:
-    """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `TAKE_OVER` · authority · added.
+    """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `HAND_OVER_SHARE` · authority · added.
 
     Where that is not finite, the guard replaces the learner in the next tick.
     """
     for k in range(2):
         if not np.isfinite(s.added[k]):
             s.guard.broken, s.added[k] = True, 0.0
-        taken = TAKE_OVER * s.guard.authority * s.added[k]
+        taken = HAND_OVER_SHARE * s.guard.authority * s.added[k]
         s.pid.integral[k] -= taken
         if s.guard.hands_over:
             s.guard.handed[k] += taken
@@ -226,8 +226,8 @@ class Hierarchy:
         looks: Whether the motion controller takes the scans of a lidar, as only a user's may.
         tunable: Whether it takes gains of Kanayama's law, which a user's need not.
         roams: Whether it goes along the reference at its own pace or leaves it, as only a user's may.
-        gains: Gains of each robot before any event, by the names and in the units of `dataset.GAINS`: `(B, 2)` for
-            `k_p` and `k_i`, `(B,)` for the others.
+        gains: Gains of each robot before any event, by the names and in the units of `dataset.GAIN_VARIABLES`: `(B, 2)`
+            for `k_p` and `k_i`, `(B,)` for the others.
     """
 
     def __init__(
@@ -312,11 +312,11 @@ class Hierarchy:
         watched = design.retune and design.time_constant is None and "feedback" not in self.stages
         if not watched:
             watch["moves"][row] = 0.0
-        watch["on"][row] = watched and watch["moves"][row] < late.MOST
+        watch["on"][row] = watched and watch["moves"][row] < late.MAX_MOVES
         supply, second = guarding.ranges(self.nominal)
         own = self.rigid and (design.steering_kp is not None or design.steering_ki is not None)
-        watch["least"][row] = late.LEAST * supply, np.inf if own else late.LEAST * second
-        watch["most_explained"][row] = late.MOST_EXPLAINED * supply, late.MOST_EXPLAINED * second
+        watch["least"][row] = late.MIN_AMPLITUDE * supply, np.inf if own else late.MIN_AMPLITUDE * second
+        watch["most_explained"][row] = late.MAX_EXPLAINED * supply, late.MAX_EXPLAINED * second
 
     def _design_pid(self, row: int) -> None:
         """Computes the gains of the PID of one robot."""
@@ -333,7 +333,7 @@ class Hierarchy:
             ahead: Number of further moves to count.
         """
         steps = (int(self.state["delay"]["moves"][row]) + ahead) // 2
-        added = steps * max(1, round(late.STEP / self.period)) * self.period
+        added = steps * max(1, round(late.DELAY_STEP / self.period)) * self.period
         if pid.delay is not None:
             pid = pid.model_copy(update={"delay": pid.delay + added})
         return pid, self.settings[row].delay + added
@@ -343,8 +343,8 @@ class Hierarchy:
         watch, slows_motion = self.state["delay"], "motion" not in self.stages
         watch["moves"][row] += 1 if slows_motion else 2
         moves = watch["moves"][row]
-        watch["on"][row] = moves < late.MOST
-        if moves <= 2 * late.SLOWED and (moves % 2 or not slows_motion):
+        watch["on"][row] = moves < late.MAX_MOVES
+        if moves <= 2 * late.LEARNER_MOVES and (moves % 2 or not slows_motion):
             self.state["guard"]["gain"][row] /= BACK_OFF
         self._design_pid(row)
         if slows_motion:
@@ -472,7 +472,7 @@ class Hierarchy:
             self._move(int(row))
         rows = np.flatnonzero(self.state["guard"]["forget"])
         if rows.size and not self.restore(rows):
-            self.state["guard"]["gain"][rows] *= UNSURE
+            self.state["guard"]["gain"][rows] *= NO_RESET_FACTOR
 
     def restore(self, rows: NDArray[np.intp]) -> bool:
         """Resets the learners of these robots; returns whether the stage can be reset."""

@@ -9,7 +9,7 @@ from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.results.dataset import SIGNALS, TICK
 
-DIVERGED = 1.0  # m of lateral error, beyond which a run has failed
+MAX_LATERAL_ERROR = 1.0  # m of lateral error, beyond which a run has failed
 
 
 @kernel
@@ -69,7 +69,7 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, rigid: bool, erro
         t.z, t.roll_angle, t.pitch_angle = state.z, state.roll, state.pitch
         t.feedforward_limited = 1.0 if c.guard.on and beyond(c.feedforward, c.guard.range, rigid) else 0.0
         t.motor_voltage_left, t.motor_voltage_right = p.applied[0], p.applied[1]
-        near &= not abs(t.lateral_error) > DIVERGED or p.failed
+        near &= not abs(t.lateral_error) > MAX_LATERAL_ERROR or p.failed
     return near
 
 
@@ -79,7 +79,7 @@ class Log:
     Attributes:
         ticks: Record of `TICK` of each tick and robot, `(length, B)`; after `length` ticks the oldest are overwritten.
         now: The records of the tick that was written last, a view, `(B,)`.
-        near: Whether in that tick all robots that had not failed were within `DIVERGED` of their references.
+        near: Whether in that tick all robots that had not failed were within `MAX_LATERAL_ERROR` of their references.
     """
 
     def __init__(self, length: int, size: int, rigid: bool) -> None:

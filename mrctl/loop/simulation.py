@@ -22,7 +22,7 @@ from mrctl.loop.events import Events
 from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.learned import LAYOUT
-from mrctl.loop.log import DIVERGED, Log
+from mrctl.loop.log import MAX_LATERAL_ERROR, Log
 from mrctl.loop.user_hierarchy import UserHierarchy
 from mrctl.loop.user_stages import StageError, UserEstimator, UserFeedforward, UserStage
 from mrctl.physics import hull, mjcf, tyres
@@ -39,9 +39,9 @@ from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
 from mrctl.theory.robot import ANY_ANGLE, LIMITS, Robot, Tyres
-from mrctl.theory.timing import RESERVE
+from mrctl.theory.timing import LIMIT_SHARE
 
-LEAST = 8  # smallest number of robots for which a thread pays
+MIN_ROBOTS_OF_THREAD = 8  # smallest number of robots for which a thread pays
 
 
 def simulate(
@@ -121,7 +121,7 @@ def cores() -> int:
 
 def worthwhile(threads: int, size: int) -> int:
     """Returns how many of the allowed threads (0 for all cores) pay for a number of robots."""
-    return min(threads or cores(), max(1, size // LEAST))
+    return min(threads or cores(), max(1, size // MIN_ROBOTS_OF_THREAD))
 
 
 def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
@@ -218,7 +218,7 @@ def suited(scenario: Scenario) -> Scenario:
     scenario = arranged(scenario)
     model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
     names = (*LIMITS, "steering_limit") if robot.steering_limit < ANY_ANGLE else LIMITS  # a caster swings to any angle
-    careful = robot.replace(**{name: RESERVE * getattr(robot, name) for name in names})
+    careful = robot.replace(**{name: LIMIT_SHARE * getattr(robot, name) for name in names})
     found = enlarged(scenario.reference, careful, mjcf.reverses(model, scenario.steering))
     return scenario.replace(reference=found or scenario.reference)
 
@@ -428,9 +428,9 @@ class Simulation:
         """Ends the tick: fails robots that have left their references, and ends runs at their goals, stuck or over."""
         plant, log, tick = self.plant, self.log, self.tick
         if not log.near and not self.hierarchy.roams:
-            for row in np.flatnonzero(np.abs(log.now["lateral_error"]) > DIVERGED):
+            for row in np.flatnonzero(np.abs(log.now["lateral_error"]) > MAX_LATERAL_ERROR):
                 if self.scenarios[row].goal is None:  # a robot with a goal may wait, or leave its reference
-                    plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
+                    plant.fail(int(row), f"lateral error over {MAX_LATERAL_ERROR:g} m")
         self.tick, self._sensed = self.tick + 1, False
         if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)
@@ -553,7 +553,7 @@ class Simulation:
     def _gains(self) -> dict[str, Any]:
         """Returns variables with the gains of the controllers before any event."""
         gains = {}
-        for name, (unit, meaning) in dataset.GAINS.items():
+        for name, (unit, meaning) in dataset.GAIN_VARIABLES.items():
             values = self.hierarchy.gains[name].copy()
             gains[name] = ("run", "channel")[: values.ndim], values, {"units": unit, "long_name": meaning}
         return gains

@@ -24,7 +24,7 @@ from mrctl.loop.user_stages import StageError
 from mrctl.record import InputError
 from mrctl.scenario import PriorName, Scenario
 
-MODEL = "model+"  # in front of the name of a feedforward that adds to the nominal model
+MODEL_PREFIX = "model+"  # in front of the name of a feedforward that adds to the nominal model
 NOT_BESIDE = {*sys.stdlib_module_names, "mrctl"}
 """Modules that are not taken from the folder of the file that imports them: in a clone, mrctl stands there too."""
 
@@ -110,12 +110,12 @@ def behind(name: str) -> tuple[PriorName, str, list[Part]]:
     Raises:
         InputError: The name is refused, as by `split`, or there is no feedforward that adds to the model.
     """
-    own = name.removeprefix(MODEL)
+    own = name.removeprefix(MODEL_PREFIX)
     found = split(own)
     if own == name:
         return "none", own, found
     if all(part.stage != "feedforward" for part in found):
-        raise InputError(f"controller: {name!r} has {MODEL} in front, but no feedforward that adds to the model")
+        raise InputError(f"controller: {name!r} has {MODEL_PREFIX} in front, but no feedforward that adds to the model")
     return "model", own, found
 
 

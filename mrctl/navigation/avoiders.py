@@ -13,7 +13,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.hybrid_astar import NoWay
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.planning import REACTIVE, SLIM, Avoid, planned
+from mrctl.navigation.planning import REACTIVE, REPLAN_MARGIN, Avoid, planned
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.navigation.window import Window
@@ -47,7 +47,7 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
         try:
             return planned(
-                start, vehicle, plan.speed, SLIM,
+                start, vehicle, plan.speed, REPLAN_MARGIN,
                 outlines=outlines, reverse=keeps and vehicle.reverses, twist=now, keeps=keeps, beyond=True,
             )[1]  # fmt: skip
         except NoWay:

@@ -15,13 +15,16 @@ from mrctl.theory.clearance import point_to_polygon
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
 from mrctl.theory.rays import Scan
 
-RADIUS = 0.05  # m, of a disc around a place, through which beams pass or not
-BESIDE = 0.1, 0.02  # m, and share of the range: how far a point may lie beside the place to which it belongs; chosen
-FAR = 0.5  # m, at most
-LEAST = 2  # least number of points of a scan that show something
-AROUND, APART = (8, 32), 0.2  # least and greatest number of places on a ring inside an obstacle, and m between; chosen
-INSIDE = 0.8, 0.4  # sizes of the two rings over that of the outline
-SCANS, MOST = 5, 0.9  # scans that pass through a place, and share of the places, at which an obstacle is gone; chosen
+PLACE_RADIUS = 0.05  # m, of a disc around a place, through which beams pass or not
+# m, and share of the range: how far a point may lie beside the place to which it belongs; chosen
+MAX_OFFSET = (0.1, 0.02)
+MAX_FAR_OFFSET = 0.5  # m, at most
+MIN_POINTS = 2  # least number of points of a scan that show something
+# least and greatest number of places on a ring inside an obstacle, and m between; chosen
+RING_PLACES, RING_SPACING = (8, 32), 0.2
+RING_SIZES = 0.8, 0.4  # sizes of the two rings over that of the outline
+# scans that pass through a place, and share of the places, at which an obstacle is gone; chosen
+GONE_SCANS, GONE_SHARE = 5, 0.9
 
 
 class Chart:
@@ -53,7 +56,7 @@ class Chart:
         if not len(points):  # nothing says that the lidar sees at all
             return False
         away = np.hypot(*(points - scan.place[:2]).T)
-        margin = np.minimum(BESIDE[0] + BESIDE[1] * away, FAR)
+        margin = np.minimum(MAX_OFFSET[0] + MAX_OFFSET[1] * away, MAX_FAR_OFFSET)
         for shape in np.flatnonzero(through(self._middles, scan)).tolist():
             places, depth = self._places[shape] = self._places.get(shape) or self._inside(shape)
             dense = scan.step * np.hypot(*(places - scan.place[:2]).T) < depth  # a beam would have met the obstacle
@@ -62,7 +65,7 @@ class Chart:
             if self._shown(shape, points, margin):
                 del passed[shape]
                 self._gone[shape] = False
-            elif np.mean(scans >= SCANS) >= MOST:
+            elif np.mean(scans >= GONE_SCANS) >= GONE_SHARE:
                 self._gone[shape] = True
         if changed := not np.array_equal(self._gone, before):
             self.outlines = _without(self.known, self._gone)
@@ -84,13 +87,13 @@ class Chart:
         if (ring := shape - len(discs)) >= 0:
             corners = edges[first[ring] : first[ring + 1], :2]
         else:
-            turn = np.linspace(0.0, 2 * np.pi, AROUND[1], endpoint=False)
+            turn = np.linspace(0.0, 2 * np.pi, RING_PLACES[1], endpoint=False)
             corners = middle + discs[shape, 2] * np.column_stack([np.cos(turn), np.sin(turn)])
         around = np.vstack([corners, corners[:1]])
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(around, axis=0).T)))
-        count = int(np.clip(np.ceil(along[-1] / APART), *AROUND))
+        count = int(np.clip(np.ceil(along[-1] / RING_SPACING), *RING_PLACES))
         outline = np.column_stack([np.interp(along[-1] / count * np.arange(count), along, side) for side in around.T])
-        places = np.concatenate([[middle], *(middle + share * (outline - middle) for share in INSIDE)])
+        places = np.concatenate([[middle], *(middle + share * (outline - middle) for share in RING_SIZES)])
         return places, -float(self._distances(shape, middle[None])[0])
 
     def _shown(self, shape: int, points: Array, margin: Array) -> bool:
@@ -100,19 +103,19 @@ class Chart:
         """
         middle, radius = self._middles[shape], self._radii[shape]
         near = np.hypot(*(points - middle).T) < radius + margin
-        if np.sum(near) < LEAST:
+        if np.sum(near) < MIN_POINTS:
             return False
         points, margin = points[near], margin[near]
         away = self._distances(shape, points)
         points, away = points[away < margin], away[away < margin]
-        others = np.hypot(*(self._middles - middle).T) < radius + self._radii + FAR
+        others = np.hypot(*(self._middles - middle).T) < radius + self._radii + MAX_FAR_OFFSET
         others[shape] = False
         for other in np.flatnonzero(others).tolist():
-            if len(points) < LEAST:
+            if len(points) < MIN_POINTS:
                 return False
             own = away <= self._distances(other, points)
             points, away = points[own], away[own]
-        return len(points) >= LEAST
+        return len(points) >= MIN_POINTS
 
 
 @kernel
@@ -132,7 +135,7 @@ def _without(known: Outlines, gone: NDArray[np.bool]) -> Outlines:
 
 
 def through(points: Array, scan: Scan) -> NDArray[np.bool]:
-    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `RADIUS` around them, `(k,)`."""
+    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `PLACE_RADIUS` there, `(k,)`."""
     found = np.empty(len(points), bool)
     beams = scan.ranges, scan.full_turn, float(scan.angles[0]), scan.step, scan.reach
     pass_through.compiled(np.ascontiguousarray(points), *beams, scan.place, found)
@@ -172,9 +175,9 @@ def pass_through(
     for k in range(len(points)):
         dx, dy = points[k, 0] - place[0], points[k, 1] - place[1]
         away = np.hypot(dx, dy)
-        half = np.arctan2(RADIUS, away)
+        half = np.arctan2(PLACE_RADIUS, away)
         beam = ((np.arctan2(dy, dx) - place[2] - first + step / 2) % (2 * np.pi)) / step
-        reach, wide = away + BESIDE[0] + BESIDE[1] * away, half / step
+        reach, wide = away + MAX_OFFSET[0] + MAX_OFFSET[1] * away, half / step
         found[k] = reach <= most
         for i in range(int(np.floor(beam - wide)), int(np.floor(beam + wide)) + 1):
             around = i % turn

@@ -12,7 +12,7 @@ from mrctl.record import InputError, Record
 from mrctl.theory.obstacles import Box, Disc, Known, Obstacle, Obstacles, Polygon, Pose
 from mrctl.theory.spline import Plane
 
-THICK = 0.1  # m, thickness of walls
+WALL_THICKNESS = 0.1  # m, thickness of walls
 
 
 class Task(Record):
@@ -58,7 +58,9 @@ def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, c
     at = (np.column_stack([columns, rows]) + 0.5) * cell - half
     discs = [Disc(x=x, y=y, radius=cell / 2) for x, y in at.tolist()]
     ahead = half + 8 * cell  # free space before and behind the field
-    walls = [Box(x=side * (half + THICK / 2), length=THICK, width=2 * ahead + 8 * cell) for side in (-1, 1)]
+    walls = [
+        Box(x=side * (half + WALL_THICKNESS / 2), length=WALL_THICKNESS, width=2 * ahead + 8 * cell) for side in (-1, 1)
+    ]
     return _task([*discs, *walls], (0.0, -ahead, np.pi / 2), (0.0, ahead, np.pi / 2))
 
 
@@ -83,12 +85,12 @@ def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, 
         InputError: A wall would fold over itself.
     """
     _positive(width=width, pieces=pieces, length=length)
-    if not 0 <= turn < np.pi / 2 or (width / 2 + THICK) * np.tan(turn / 2) >= length / 2:
+    if not 0 <= turn < np.pi / 2 or (width / 2 + WALL_THICKNESS) * np.tan(turn / 2) >= length / 2:
         raise InputError(f"turn: pieces of {length:g} m that are {width:g} m wide cannot bend by {turn:g} rad")
     headings, middle, mitre = bent_line(seed, pieces, length, turn)
     walls = []
     for side in (-1, 1):
-        near, far = (middle + side * offset * mitre for offset in (width / 2, width / 2 + THICK))
+        near, far = (middle + side * offset * mitre for offset in (width / 2, width / 2 + WALL_THICKNESS))
         for k in range(pieces):
             corners = [complex(corner) for corner in (near[k], near[k + 1], far[k + 1], far[k])]
             walls.append(Polygon(points=tuple((corner.real, corner.imag) for corner in corners)))
@@ -186,7 +188,7 @@ def doorway(width: float, seed: int = 0, room: float = 4.0) -> Task:
     corners = [(-room, -half), (room, -half), (room, half), (-room, half), (-room, -half)]
     points = [complex(*corner) for corner in corners]
     walls = [_wall(a, b) for a, b in zip(points[:-1], points[1:], strict=True)]
-    jamb = (width + THICK) / 2
+    jamb = (width + WALL_THICKNESS) / 2
     walls += [_wall(complex(0, -half), complex(0, door - jamb)), _wall(complex(0, door + jamb), complex(0, half))]
     return _task(walls, (-half, first, 0.0), (half, last, 0.0))
 
@@ -204,7 +206,9 @@ def parking_bay(length: float, width: float, seed: int = 0, lane: float = 1.5) -
     along, offset = np.random.default_rng(seed).uniform(-0.1, 0.1, 2) * (length, lane)
     cars = [Box(x=side * length, y=-width / 2, length=length, width=width) for side in (-1, 1)]
     ends = 2 * length
-    walls = [_wall(complex(-ends, y), complex(ends, y)) for y in (-width - THICK / 2, lane + THICK / 2)]
+    walls = [
+        _wall(complex(-ends, y), complex(ends, y)) for y in (-width - WALL_THICKNESS / 2, lane + WALL_THICKNESS / 2)
+    ]
     return _task([*cars, *walls], (float(-length + along), float(lane / 2 + offset), 0.0), (0.0, -width / 2, 0.0))
 
 
@@ -239,7 +243,7 @@ def _wall(start: complex, end: complex) -> Box:
     """Returns a wall along a line from x + i y to x + i y in m, which reaches half its thickness beyond either end."""
     middle, along = (start + end) / 2, end - start
     angle = float(np.angle(along))
-    return Box(x=middle.real, y=middle.imag, angle=angle, length=abs(along) + THICK, width=THICK)
+    return Box(x=middle.real, y=middle.imag, angle=angle, length=abs(along) + WALL_THICKNESS, width=WALL_THICKNESS)
 
 
 def _task(shapes: Sequence[Obstacle], start: Sequence[float], goal: Sequence[float]) -> Task:

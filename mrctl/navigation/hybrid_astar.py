@@ -5,7 +5,7 @@ IJRR 29(5), 2010. Each cell holds the best pose that was found in it, and six ar
 from there. From a pose the search also tries the shortest path to the goal that ignores obstacles, as one more arc (the
 analytic expansion). If an obstacle blocks it after d metres, the poses that follow try again once they are d/2 further;
 those that were skipped are tried when no pose is left. The heuristic is the larger of that path's length and of the way
-around the obstacles on the plane, times `WEIGHT` (Pohl, "Heuristic search viewed as path finding in a graph",
+around the obstacles on the plane, times `HEURISTIC_WEIGHT` (Pohl, "Heuristic search viewed as path finding in a graph",
 Artificial Intelligence 1, 1970). The budget is a number of poses; ties go to the earlier pose.
 """
 
@@ -20,22 +20,23 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
 from mrctl.navigation.plan import Plan
-from mrctl.navigation.steer import CHECK, PIECES, Curve, advance, sample, shortest, steer
+from mrctl.navigation.steer import CHECK_SPACING, MAX_PIECES, Curve, advance, sample, shortest, steer
 from mrctl.record import InputError
 from mrctl.theory.clearance import clearance, cover, gap, point_to_polygon
 from mrctl.theory.grid import Field, field_of, value
 from mrctl.theory.obstacles import Outlines
 
 HEADINGS = 72
-REVERSE = 1.5  # cost of a metre in reverse
-SWITCH = 0.5  # cost of a change of direction, m
-STRIDE = 5  # of these poses, between those to which shortcuts are looked for
-DISCS = 4  # that cover the footprint; where one of them touches, the footprint itself is looked at
-EXPANSION = 2.0  # in place of the turn of an arc, a shortest path to the goal
-WEIGHT = 1.04  # of the heuristic, and so about the most by which a plan costs more than the cheapest; chosen
-AGAIN = 0.5  # share of the free part of a shortest path that hits something, after which another one is tried; chosen
-SLACK = 2.0  # cells, by which the way around the obstacles may be too long
-MOST_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, and three times that with reversing
+REVERSE_COST = 1.5  # cost of a metre in reverse
+SWITCH_COST = 0.5  # cost of a change of direction, m
+SHORTCUT_STRIDE = 5  # of these poses, between those to which shortcuts are looked for
+FOOTPRINT_DISCS = 4  # that cover the footprint; where one of them touches, the footprint itself is looked at
+SHORTEST_PATH = 2.0  # in place of the turn of an arc, a shortest path to the goal
+HEURISTIC_WEIGHT = 1.04  # of the heuristic, and so about the most by which a plan costs more than the cheapest; chosen
+# share of the free part of a shortest path that hits something, after which another one is tried; chosen
+RETRY_SHARE = 0.5
+HEURISTIC_SLACK = 2.0  # cells, by which the way around the obstacles may be too long
+MAX_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, and three times that with reversing
 
 
 class NoWay(InputError):
@@ -84,7 +85,7 @@ class Tree(NamedTuple):
     parents: NDArray[np.int64]
     """Pose before each, −1 for the start, `(N,)`."""
     turns: Array
-    """Turn of the arc that leads to each, as in `Curve`, or `EXPANSION` for a shortest path to the goal, `(N,)`."""
+    """Turn of the arc that leads to each, as in `Curve`, or `SHORTEST_PATH` for a shortest path to the goal, `(N,)`."""
     lengths: Array
     """Signed length of that arc in m; of a shortest path the direction of its end, `(N,)`."""
     costs: Array
@@ -112,9 +113,9 @@ def space(
         InputError: The rectangle is empty, or has too many cells.
     """
     cells = float(np.prod(np.ceil((np.asarray(high) - low) / cell)))
-    if cells > MOST_CELLS:
-        raise InputError(f"map: {cells:,.0f} cells of {cell:.3g} m are more than {MOST_CELLS:,}, which a search takes")
-    discs, sides = cover(footprint, DISCS), np.hstack([footprint, np.roll(footprint, -1, axis=0)])
+    if cells > MAX_CELLS:
+        raise InputError(f"map: {cells:,.0f} cells of {cell:.3g} m are more than {MAX_CELLS:,}, which a search takes")
+    discs, sides = cover(footprint, FOOTPRINT_DISCS), np.hstack([footprint, np.roll(footprint, -1, axis=0)])
     depths = np.array([-point_to_polygon.compiled(x, y, sides) for x, y, _ in discs])
     reach = float(np.hypot(*footprint.T).max())
     return Space(outlines, field_of(outlines, low, high, cell), footprint, discs, depths, reach, margin)
@@ -207,7 +208,7 @@ def _shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
         other, found = farthest.compiled(whole.poses, steps, now, radius, reverse, last, where, cost)
         if other > now:
             curve = steer(whole.poses[now], whole.poses[other], radius, reverse)
-            piece, direction = (column[1:] for column in sample(whole.poses[now], curve, radius, CHECK))
+            piece, direction = (column[1:] for column in sample(whole.poses[now], curve, radius, CHECK_SPACING))
         else:
             other, found = now + 1, cost[now + 1]
             piece, direction = whole.poses[other : other + 1], whole.directions[other : other + 1]
@@ -244,7 +245,7 @@ def farthest(
             cost[k] += cost_of(steps[k], direction)
             direction = np.sign(steps[k])
     sides, end = np.empty((len(where.footprint), 4)), np.empty(3)
-    for k in range(n - 1, now, -STRIDE):
+    for k in range(n - 1, now, -SHORTCUT_STRIDE):
         after = steps[k + 1] if k + 1 < n else 0.0  # the plan goes on with its first step after the path
         most = cost[k + 1] - cost_of(after, 0.0) if k + 1 < n else cost[k]
         found, direction, _ = analytic_expansion(
@@ -351,8 +352,8 @@ def cell_of(pose: Array, where: Space) -> tuple[int, int, int]:
 def free_length(pose: Array, turn: float, radius: float, way: float, where: Space, sides: Array, end: Array) -> float:
     """Drives along an arc, as `advance` does, and returns how far it is free in m, |way| where it is to its end.
 
-    Poses are looked at every `CHECK`, but for those that are so near one before that P has not left a circle about it
-    in which the robot is free.
+    Poses are looked at every `CHECK_SPACING`, but for those that are so near one before that P has not left a circle
+    about it in which the robot is free.
 
     Args:
         pose: Pose at its start in m, m, rad, `(3,)`.
@@ -363,7 +364,7 @@ def free_length(pose: Array, turn: float, radius: float, way: float, where: Spac
         sides: Scratch, `(n, 4)`.
         end: Out: the last pose that was looked at, `(3,)`.
     """
-    field, count, k = where.field, int(np.ceil(abs(way) / CHECK)), 0
+    field, count, k = where.field, int(np.ceil(abs(way) / CHECK_SPACING)), 0
     rows, columns = field.distance.shape
     while k < count:
         k += 1
@@ -378,15 +379,15 @@ def free_length(pose: Array, turn: float, radius: float, way: float, where: Spac
             continue
         x, y = end[0] - field.origin[0], end[1] - field.origin[1]
         free = min(free, x, y, columns * field.resolution - x, rows * field.resolution - y)
-        k = max(k, min(k + int(free / CHECK), count - 1))
+        k = max(k, min(k + int(free / CHECK_SPACING), count - 1))
     return abs(way)
 
 
 @kernel
 def cost_of(way: float, last: float) -> float:
     """Returns the cost of a way in m, negative in reverse, after one in the direction `last`, 0 at the start."""
-    switch = SWITCH if way * last < 0 else 0.0
-    return switch + (way if way >= 0 else -REVERSE * way)
+    switch = SWITCH_COST if way * last < 0 else 0.0
+    return switch + (way if way >= 0 else -REVERSE_COST * way)
 
 
 @kernel
@@ -411,7 +412,7 @@ def analytic_expansion(
         Its cost in m, infinite if it hits something or costs too much, the direction of its end, and how far it is free
         in m.
     """
-    turns, lengths = np.zeros(PIECES), np.zeros(PIECES)
+    turns, lengths = np.zeros(MAX_PIECES), np.zeros(MAX_PIECES)
     shortest(start, goal, radius, reverse, turns, lengths)
     cost, direction, free = 0.0, last, 0.0
     for length in lengths:
@@ -421,7 +422,7 @@ def analytic_expansion(
     if cost >= most:
         return np.inf, direction, free
     now = start.copy()
-    for k in range(PIECES):
+    for k in range(MAX_PIECES):
         if lengths[k] == 0.0:
             continue
         driven = free_length(now, turns[k], radius, lengths[k], where, sides, end)
@@ -476,18 +477,18 @@ def search(
         expanded, and whether an arc led out of the area.
     """
     most, n, cell = len(tree.poses), 1, where.field.resolution
-    weight, gears = WEIGHT if ahead.any() else 0.0, best.shape[3]
+    weight, gears = HEURISTIC_WEIGHT if ahead.any() else 0.0, best.shape[3]
     sides, end = np.empty((len(where.footprint), 4)), np.empty(3)
-    turns, lengths = np.zeros(PIECES), np.zeros(PIECES)
+    turns, lengths = np.zeros(MAX_PIECES), np.zeros(MAX_PIECES)
     tree.poses[0], tree.parents[0], tree.turns[0], tree.lengths[0], tree.costs[0] = start, -1, 0.0, 0.0, 0.0
     tree.direct[0], tree.again[0] = shortest(start, goal, radius, reverse, turns, lengths), 0.0
-    checks = int(np.ceil(step / CHECK))  # of an arc, as `free_length` makes them, to the last bit of its end
+    checks = int(np.ceil(step / CHECK_SPACING))  # of an arc, as `free_length` makes them, to the last bit of its end
     queue, late, expanded, left = [(0.0, 0)], [0 for _ in range(0)], 0, False
     room = np.full((2, 3), -1.0)
     while len(queue) + len(late) > 0:
         delayed = len(queue) == 0  # there is no way but by a shortest path that was not tried
         now = late.pop() if delayed else heapq.heappop(queue)[1]
-        if tree.turns[now] == EXPANSION:
+        if tree.turns[now] == SHORTEST_PATH:
             return now, n, expanded, left
         pose, last = tree.poses[now], np.sign(tree.lengths[now])
         if delayed:  # most of these paths hit something near the goal
@@ -495,7 +496,7 @@ def search(
                 room_before(goal, radius, where, sides, end, room)
             shortest(pose, goal, radius, reverse, turns, lengths)
             k = int(np.flatnonzero(lengths)[-1]) if lengths.any() else 0
-            if abs(lengths[k]) > room[int(lengths[k] > 0), int(turns[k]) + 1] + CHECK:
+            if abs(lengths[k]) > room[int(lengths[k] > 0), int(turns[k]) + 1] + CHECK_SPACING:
                 continue
         row, column, heading = cell_of(pose, where)
         if now > 0 and best[row, column, heading, int(last + 1) % gears] != now + 1:
@@ -504,14 +505,14 @@ def search(
         if n + 7 > most:
             return -2, n, expanded, left
         # A path that is shorter than the way around the obstacles hits one.
-        if tree.direct[now] >= ahead[row, column] - SLACK * cell:
+        if tree.direct[now] >= ahead[row, column] - HEURISTIC_SLACK * cell:
             if not delayed and tree.costs[now] < tree.again[now]:
                 late.append(now)
             else:
                 cost, direction, free = analytic_expansion(pose, goal, radius, reverse, last, np.inf, where, sides, end)
-                tree.again[now] = tree.costs[now] + AGAIN * free
+                tree.again[now] = tree.costs[now] + RETRY_SHARE * free
                 if cost < np.inf:
-                    tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n] = goal, now, EXPANSION, direction
+                    tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n] = goal, now, SHORTEST_PATH, direction
                     tree.costs[n] = tree.costs[now] + cost
                     heapq.heappush(queue, (tree.costs[n], n))
                     n += 1
@@ -530,7 +531,7 @@ def search(
             if free_length(pose, turn, radius, way, where, sides, end) < step:  # which takes most of the time
                 continue
             tree.direct[n] = shortest(end, goal, radius, reverse, turns, lengths)
-            estimate = weight * max(ahead[row, column] - SLACK * cell, tree.direct[n])
+            estimate = weight * max(ahead[row, column] - HEURISTIC_SLACK * cell, tree.direct[n])
             tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n], tree.costs[n] = end, now, turn, way, cost
             tree.again[n], best[row, column, heading, gear] = tree.again[now], n + 1
             heapq.heappush(queue, (cost + estimate, n))
@@ -546,7 +547,7 @@ def _traced(tree: Tree, count: int, last: int, radius: float, reverse: bool, exp
     arcs = np.array(chain[-2:0:-1], int)
     final = steer(tree.poses[tree.parents[last]], tree.poses[last], radius, reverse)
     curve = Curve(np.append(tree.turns[arcs], final.turns), np.append(tree.lengths[arcs], final.lengths))
-    poses, directions = sample(tree.poses[0], curve, radius, CHECK)
-    made = np.flatnonzero((tree.parents[:count] >= 0) & (tree.turns[:count] != EXPANSION))
+    poses, directions = sample(tree.poses[0], curve, radius, CHECK_SPACING)
+    made = np.flatnonzero((tree.parents[:count] >= 0) & (tree.turns[:count] != SHORTEST_PATH))
     searched = np.stack([tree.poses[tree.parents[made], :2], tree.poses[made, :2]], axis=1)
     return Plan(poses, directions, float(tree.costs[last]), expanded, searched)

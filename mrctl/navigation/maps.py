@@ -19,9 +19,9 @@ from pydantic import Field
 from mrctl.kernel import Array
 from mrctl.record import InputError, Record, read_file
 from mrctl.theory.grid import check_size, rectangles
-from mrctl.theory.obstacles import MOST, Box, Obstacles, Pose, turned
+from mrctl.theory.obstacles import MAX_OBSTACLES, Box, Obstacles, Pose, turned
 
-IMAGE = 64 * 2**20  # bytes of an image
+MAX_IMAGE_BYTES = 64 * 2**20  # bytes of an image
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -61,8 +61,10 @@ class Map(NamedTuple):
             InputError: There are more than 20,000.
         """
         found = rectangles(self.occupancy == 100)
-        if len(found) > MOST:
-            raise InputError(f"map: {len(found):,} rectangles are more than {MOST:,}; take a coarser or a cleaner map")
+        if len(found) > MAX_OBSTACLES:
+            raise InputError(
+                f"map: {len(found):,} rectangles are more than {MAX_OBSTACLES:,}; take a coarser or a cleaner map"
+            )
         size = (found[:, 2:] - found[:, :2]) * self.resolution
         middles = turned((found[:, 2:] + found[:, :2]) / 2 * self.resolution, self.origin)
         angle = float(self.origin[2])
@@ -123,7 +125,7 @@ def _pixels(path: Path) -> Array:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(read_file(path, IMAGE))) as image:
+            with Image.open(io.BytesIO(read_file(path, MAX_IMAGE_BYTES))) as image:
                 check_size(image.height, image.width, f"{path}: image")
                 if image.mode.startswith("I"):
                     return np.asarray(image, float)[..., None] / 257  # 16 bits

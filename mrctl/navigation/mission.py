@@ -18,14 +18,14 @@ from mrctl.loop.simulation import simulate
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.plan import Plan
-from mrctl.navigation.planning import MARGIN, Avoid, prepared
+from mrctl.navigation.planning import PLAN_MARGIN, Avoid, prepared
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.obstacles import Pose
 
-JERKED = 0.1  # s, step of the differences whose third is the jerk; chosen
-LARGEST = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of its world
+JERK_STEP = 0.1  # s, step of the differences whose third is the jerk; chosen
+MAX_BYTES = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of its world
 
 
 class Mission(NamedTuple):
@@ -57,7 +57,7 @@ class Order(Record):
     """Feedforwards of further robots."""
     speed: float | None = None
     """Largest speed in m/s; by default 0.9 of the robot's."""
-    margin: float = MARGIN
+    margin: float = PLAN_MARGIN
     """Clearance that the plan keeps in m."""
     avoid: Avoid = "none"
     """Law that keeps the robot from obstacles that its map does not have."""
@@ -80,7 +80,7 @@ def order_of(folder: str | Path) -> Order:
     if Path(folder).is_dir() and not path.exists():
         raise InputError(f"{folder}: holds no mission, as there is no mission.json in it")
     try:
-        values = json.loads(read_file(path, LARGEST))
+        values = json.loads(read_file(path, MAX_BYTES))
     except ValueError:
         raise InputError(f"{path}: is not JSON") from None
     known = values if isinstance(values, dict) else {}
@@ -97,7 +97,7 @@ def navigate(
     scenario: Scenario,
     compare: Sequence[FeedforwardName] = (),
     speed: float | None = None,
-    margin: float = MARGIN,
+    margin: float = PLAN_MARGIN,
     avoid: Avoid = "none",
     progress: bool = False,
 ) -> Mission:
@@ -190,14 +190,14 @@ def reached(run: xr.Dataset, goal: Pose) -> bool:
 def jerk_of(places: Array, period: float) -> float:
     """Returns the RMS of the jerk of a robot in m/s³: of the third derivative of its position in the world.
 
-    It is the third difference of the position over steps of `JERKED`, so that the vibration of single ticks, which says
-    nothing about the ride, does not count; NaN for a run that is shorter than three of them.
+    It is the third difference of the position over steps of `JERK_STEP`, so that the vibration of single ticks, which
+    says nothing about the ride, does not count; NaN for a run that is shorter than three of them.
 
     Args:
         places: x and y at each tick in m, `(T, 2)`.
         period: Control period in s.
     """
-    n = max(1, round(JERKED / period))
+    n = max(1, round(JERK_STEP / period))
     p, q, r, s = (places[k * n : len(places) - (3 - k) * n] for k in range(4))
     jerks = (s - 3 * r + 3 * q - p) / (n * period) ** 3
     return float(np.sqrt(np.mean(np.sum(jerks**2, axis=1)))) if len(jerks) else np.nan

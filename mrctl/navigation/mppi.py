@@ -12,18 +12,18 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.navigation.reactive import Reactive
 from mrctl.navigation.replanning import Replan
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Scene, roll_out
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH_COST, Considered, Scene, roll_out
 from mrctl.record import InputError
 from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
 TEMPERATURE = 0.05  # λ, in units of the cost; chosen
-ORDINARY = 0.2  # m/s, largest V below which λ falls as V², as the costs by which the roll-outs differ do; chosen
-WORTH = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
-KEPT = 40  # of the samples, which are kept to be looked at
-SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
-MOST_LAG = 10.0  # s
-BEHIND = 0.5  # share of the way to its target that may be left at the end of a roll-out that gets on; chosen
+ORDINARY_SPEED = 0.2  # m/s, largest V below which λ falls as V², as the costs by which the roll-outs differ do; chosen
+MAX_COST_DIFFERENCE = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
+SHOWN_SAMPLES = 40  # of the samples, which are kept to be looked at
+NOISE = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
+MAX_LAG = 10.0  # s
+MAX_LEFT = 0.5  # share of the way to its target that may be left at the end of a roll-out that gets on; chosen
 
 
 class Mppi(Reactive):
@@ -41,8 +41,8 @@ class Mppi(Reactive):
         Raises:
             InputError: The lag is negative or too large.
         """
-        if not 0 <= lag <= MOST_LAG:
-            raise InputError(f"lag: must be between 0 and {MOST_LAG:g} s, not {lag:g}")
+        if not 0 <= lag <= MAX_LAG:
+            raise InputError(f"lag: must be between 0 and {MAX_LAG:g} s, not {lag:g}")
         super().__init__(robot, size, replan)
         self._lag = lag
 
@@ -62,24 +62,24 @@ class Mppi(Reactive):
         assert considered is not None
         way, target = considered.paths(period)[1], scene.targets[-1, :2]
         left, before = (float(np.hypot(*(target - place))) for place in (way[-1], way[0]))
-        return left < BEHIND * before
+        return left < MAX_LEFT * before
 
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""
         nominal, twists, costs, bounds = self._nominal[row], self._twists, self._costs, self.bounds[row]
-        knots = self._noise * (np.array(SPREAD) * (bounds.speed, bounds.rotation))
+        knots = self._noise * (np.array(NOISE) * (bounds.speed, bounds.rotation))
         knots[0] = 0.0  # one roll-out is nominal, and another brakes
         knots[1] = -bounds.speed, 0.0
         nominal[:-1] = nominal[1:].copy()  # a period has passed
         state = pose, twist, last, self._lag, period, bounds, scene
-        temperature = TEMPERATURE * min(1.0, bounds.speed / ORDINARY) ** 2
-        worth = WORTH * temperature
+        temperature = TEMPERATURE * min(1.0, bounds.speed / ORDINARY_SPEED) ** 2
+        worth = MAX_COST_DIFFERENCE * temperature
         roll_out.compiled(knots, nominal, *state, worth, twists, costs)
         weights = np.exp((costs.min() - costs) / temperature)
         mean = (weights[:, None, None] / weights.sum() * twists).sum(axis=0)  # BLAS adds in an order of its own
-        cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
-        touches = costs.min() >= TOUCH
+        cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // SHOWN_SAMPLES].copy()
+        touches = costs.min() >= TOUCH_COST
         roll_out.compiled(knots[:1], mean, *state, worth, twists[:1], costs[:1])
-        nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
+        nominal[:] = mean if touches or costs[0] < TOUCH_COST else cheapest
         self.considered[row] = Considered(pose.copy(), some, nominal.copy())
         return nominal[0]

@@ -12,22 +12,23 @@ import numpy as np
 
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.kernel import Array, Rows, kernel
-from mrctl.loop.goals import RESTING
+from mrctl.loop.goals import ARRIVAL_SPEED
 from mrctl.navigation.barrier import Barrier, approach, share
 from mrctl.navigation.plan import least_clearance
-from mrctl.navigation.replanning import RETRY, SHORTER, WAITED, Planner, Replan
+from mrctl.navigation.replanning import BLOCKED_RETRY, HEADWAY_TIME, SHORTER_SHARE, Planner, Replan
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import rim
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
-BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
-RIM = 0.02  # m, radius of the discs around the robot, which reach as far beyond its footprint
-KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
-TRACKED = 0.01  # m, for errors of tracking: by so much the margin from the map is at least below that of the plan
+BRAKING_SHARE = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+RIM_RADIUS = 0.02  # m, radius of the discs around the robot, which reach as far beyond its footprint
+MAP_MARGIN, MOVING_MARGIN = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
+# m, for errors of tracking: by so much the margin from the map is at least below that of the plan
+TRACKING_MARGIN = 0.01
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
-SLOW = 0.1  # mean λ over the time WAITED, below which a robot makes no headway; chosen
+MIN_PACE = 0.1  # mean λ over the time HEADWAY_TIME, below which a robot makes no headway; chosen
 
 
 class Following:
@@ -68,9 +69,9 @@ class Pacer:
             period: Motion period in s.
         """
         self._planner, self._robot, self._period = planner, robot, period
-        self._brakes = BRAKING * robot.max_acceleration
-        self._discs = rim(planner.vehicle.footprint, RIM)
-        self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
+        self._brakes = BRAKING_SHARE * robot.max_acceleration
+        self._discs = rim(planner.vehicle.footprint, RIM_RADIUS)
+        self._near, self._away = self._barrier(-RIM_RADIUS), self._barrier(MOVING_MARGIN)
         self._pace, self._driven = 1.0, np.zeros(2)  # λ, and the twist of the plan at this pace, m/s and rad/s
         planner.reset()
         scenario = planner.scenario
@@ -94,7 +95,7 @@ class Pacer:
         self._plan = np.hstack(plan.sample(np.asarray(step * ticks, float)))
         # The margin from the map is smaller than what the plan has, and negative where the discs overlap the map on it.
         free = least_clearance(footprint, plan, self._planner.sight.map)
-        self._kept = self._barrier(min(KEPT, free - RIM - TRACKED))
+        self._kept = self._barrier(min(MAP_MARGIN, free - RIM_RADIUS - TRACKING_MARGIN))
         self._clock, self._anchor = 0.0, 0.0  # the clock in motion periods: now, and where the robot last made headway
         self._place = np.inf  # the clock at which the plan is blocked, in motion periods; infinite where it is free
         self._stops = False  # whether the robot stops for a shorter way
@@ -142,7 +143,7 @@ class Pacer:
         """
         before, twist = self._pace, reference[3:5].copy()
         change = self._period * self._robot.max_acceleration / max(abs(float(twist[0])), 1e-9)
-        self._pace = min(max(self._share(request, pose, time), before - change), before + BRAKING * change, 1.0)
+        self._pace = min(max(self._share(request, pose, time), before - change), before + BRAKING_SHARE * change, 1.0)
         reference[3:5] = self._driven = self._pace * twist
         reference[5:] = self._pace * self._pace * reference[5:] + (self._pace - before) / self._period * twist
         self._clock += self._pace
@@ -164,7 +165,7 @@ class Pacer:
         """Takes another plan if its own is blocked, if a changed map allows a shorter one, or if it makes no headway.
 
         It does so only after a new scan. A plan that begins at about the robot's speed is taken at once. For a shorter
-        one that does not, the robot stops first. It also plans where it has made no headway for `WAITED` beside
+        one that does not, the robot stops first. It also plans where it has made no headway for `HEADWAY_TIME` beside
         something that stands.
 
         Args:
@@ -177,25 +178,27 @@ class Pacer:
             return
         planner.looked = False
         if self._stops:
-            if abs(velocity) < RESTING:
+            if abs(velocity) < ARRIVAL_SPEED:
                 self._stops = False
                 if plan := planner.plan(pose, self._driven, now):
                     self._begin(plan, now)
             return
         blocked = planner.is_blocked(now)
-        if self._clock - self._anchor > SLOW * WAITED / self._period or not len(planner.sight.standing.discs):
+        if self._clock - self._anchor > MIN_PACE * HEADWAY_TIME / self._period or not len(planner.sight.standing.discs):
             self._anchor, planner.got_on = self._clock, now
-        if now - planner.got_on >= WAITED:
+        if now - planner.got_on >= HEADWAY_TIME:
             planner.got_on = planner.tried = now  # where there is no other plan, it tries again later
             if plan := planner.plan(pose, self._driven, now):
                 self._begin(plan, now)
-        elif planner.map_changed or (blocked and now - planner.tried >= RETRY):
+        elif planner.map_changed or (blocked and now - planner.tried >= BLOCKED_RETRY):
             left = np.inf if blocked else self._period * (len(self._plan) - self._clock)
             planner.tried = now
             if plan := planner.plan(pose, self._driven, now, ahead=not planner.map_changed):
                 excess = self._driven[0] - plan.sample(np.zeros(1)).twist[0, 0]
-                at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
-                if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
+                at_once = (
+                    excess**2 < 2 * self._robot.max_acceleration * TRACKING_MARGIN
+                )  # so far it is off while it brakes
+                if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER_SHARE * left:
                     if at_once:
                         self._begin(plan, now)
                     else:
@@ -215,8 +218,8 @@ class Pacing:
 
     Where something that stands and is not on the map blocks the plan, the robot drives on along another plan that
     begins with about its speed. If there is none, it stops `STANDOFF` before that place, and makes a plan there. Where
-    the map has changed and another plan takes less than `SHORTER` of the time that is left, it takes that plan; if the
-    plan cannot begin with about the speed of the robot, it stops first.
+    the map has changed and another plan takes less than `SHORTER_SHARE` of the time that is left, it takes that plan;
+    if the plan cannot begin with about the speed of the robot, it stops first.
 
     Attributes:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.

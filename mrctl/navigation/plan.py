@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.steer import CHECK
+from mrctl.navigation.steer import CHECK_SPACING
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import Limits
 
-LEAST = 1e-3  # m, chord below which the heading of an end is not looked at
-STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
+MIN_CHORD = 1e-3  # m, chord below which the heading of an end is not looked at
+NEARLY_STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
 
 
 class Plan(NamedTuple):
@@ -96,7 +96,7 @@ def run_out(start: Array, velocity: float, curvature: float, limits: Limits) -> 
         Poses from the start on, at most 5 cm apart, `(n, 3)`.
     """
     length = velocity * limits.smoothing / 2 + velocity**2 / (2 * limits.acceleration)
-    way = np.linspace(0, length, int(np.ceil(length / CHECK)) + 1)
+    way = np.linspace(0, length, int(np.ceil(length / CHECK_SPACING)) + 1)
     chord = way * np.sinc(curvature * way / (2 * np.pi))
     heading = start[2] + curvature * way / 2
     return np.column_stack([
@@ -117,8 +117,8 @@ def _points(poses: Array, spacing: float, near: bool) -> Array:
     lengths = np.abs(chords) / np.sinc(turns / (2 * np.pi))
     way = np.append(0, np.cumsum(lengths))
     places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
-    if near and places[1] > 2 * CHECK:
-        places = np.insert(places, 1, CHECK)
+    if near and places[1] > 2 * CHECK_SPACING:
+        places = np.insert(places, 1, CHECK_SPACING)
     arc = np.clip(np.searchsorted(way, places, side="right") - 1, 0, len(chords) - 1)
     ahead = places - way[arc]
     turn = turns[arc] * ahead / lengths[arc]
@@ -138,8 +138,8 @@ def _bends(points: Array, start: float, end: float, reverse: bool) -> tuple[floa
     """
     first, last = np.diff(points @ (1, 1j))[[0, -1]] * (-1 if reverse else 1)
     before, after = np.angle([first * np.exp(-1j * start), np.exp(1j * end) / last])  # half of the turns of the arcs
-    bends = [2 * np.sin(half) / max(abs(chord), LEAST) for half, chord in ((before, first), (after, last))]
-    return tuple(round(bend, 6) or STRAIGHT for bend in bends)  # type: ignore[return-value]
+    bends = [2 * np.sin(half) / max(abs(chord), MIN_CHORD) for half, chord in ((before, first), (after, last))]
+    return tuple(round(bend, 6) or NEARLY_STRAIGHT for bend in bends)  # type: ignore[return-value]
 
 
 def least_clearance(footprint: Array, plan: Waypoints, outlines: Outlines) -> float:

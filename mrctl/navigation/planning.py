@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.loop.goals import RESTING, arrived
+from mrctl.loop.goals import ARRIVAL_SPEED, arrived
 from mrctl.navigation.generators import Task
 from mrctl.navigation.hybrid_astar import NoWay, plan, shortcut, space, wider
 from mrctl.navigation.plan import Plan, least_clearance, run_out
@@ -19,19 +19,22 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines, Surroundings
-from mrctl.theory.references import SLOWEST, Waypoints, check
+from mrctl.theory.references import MIN_SPEED, Waypoints, check
 from mrctl.theory.robot import ANY_ANGLE
-from mrctl.theory.timing import RESERVE, Limits
+from mrctl.theory.timing import LIMIT_SHARE, Limits
 
-ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
-TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
-GENTLER = 1.2  # factor on that radius, for a second plan where the spline of the first steers beyond the limit
-WIDER = 2.0  # factor on it where a plan may reverse; chosen when splines were straight at changes of direction
-CELLS = 4  # of the search in the width of the robot
-PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING where something keeps it from obstacles
-MARGIN = 0.05  # m, margin of a plan
-SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
-PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
+# turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
+RADIUS_FACTOR = 1.4
+MIN_RADIUS = 0.25  # m, turning radius of the plan where a robot could turn on the spot
+GENTLER_FACTOR = 1.2  # factor on that radius, for a second plan where the spline of the first steers beyond the limit
+# factor on it where a plan may reverse; chosen when splines were straight at changes of direction
+REVERSING_FACTOR = 2.0
+CELLS_PER_WIDTH = 4  # of the search in the width of the robot
+# time of a mission over that of its plan; WAITING_PATIENCE where something keeps it from obstacles
+PATIENCE, WAITING_PATIENCE = 2, 4
+PLAN_MARGIN = 0.05  # m, margin of a plan
+REPLAN_MARGIN = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
+REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
 REACTIVE = "window", "mppi"
@@ -42,7 +45,7 @@ def prepared(
     task: Task,
     scenario: Scenario,
     speed: float | None = None,
-    margin: float = MARGIN,
+    margin: float = PLAN_MARGIN,
     avoid: Avoid = "none",
     twist: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Plan, Scenario]:
@@ -71,12 +74,15 @@ def prepared(
         at_rest = partial(_planned, task, vehicle, speed, margin, None, (0.0, 0.0), True)
         _or_beyond(partial(at_rest, True))  # raises, too, if there is none
         raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
-    laps = PATIENCE if avoid == "none" else WAITING
+    laps = PATIENCE if avoid == "none" else WAITING_PATIENCE
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
         tick = scenario.control_period
         shortest = max(tick, 0.01)  # s, that a scenario takes
-        own |= {"motion_period": max(1, round(PERIOD / tick)) * tick, "prefilter": scenario.prefilter or shortest}
+        own |= {
+            "motion_period": max(1, round(REACTIVE_PERIOD / tick)) * tick,
+            "prefilter": scenario.prefilter or shortest,
+        }
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
@@ -126,8 +132,8 @@ def planned(
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
     fastest = vehicle.robot.max_speed
-    if speed is not None and not SLOWEST <= speed <= fastest:
-        raise InputError(f"speed: must be between {SLOWEST:g} and {fastest:g} m/s, not {speed:g}")
+    if speed is not None and not MIN_SPEED <= speed <= fastest:
+        raise InputError(f"speed: must be between {MIN_SPEED:g} and {fastest:g} m/s, not {speed:g}")
 
     search = partial(_planned, task, vehicle, speed, margin, outlines, twist, keeps)
 
@@ -192,13 +198,13 @@ def _planned(
             touch an obstacle on it.
     """
     known, (corners, robot, _) = task.known, vehicle
-    speed = RESERVE * robot.max_speed if speed is None else speed
+    speed = LIMIT_SHARE * robot.max_speed if speed is None else speed
     outlines = Surroundings(known).at(0.0) if outlines is None else outlines
-    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
-        WIDER if reverse else 1
+    radius = max(MIN_RADIUS, RADIUS_FACTOR * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
+        REVERSING_FACTOR if reverse else 1
     )
     start, goal, limits = np.array(task.start), np.array(task.goal), Limits.of(robot)
-    velocity, turn = twist if twist[0] > RESTING else (0.0, 0.0)
+    velocity, turn = twist if twist[0] > ARRIVAL_SPEED else (0.0, 0.0)
     arc, curvature = start[None], 0.0  # on which it comes to rest
     if velocity and keeps:
         curvature = float(np.clip(turn / velocity, -1 / radius, 1 / radius))
@@ -207,7 +213,7 @@ def _planned(
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
     if known.shapes:
         low, high = np.minimum(low, known.bounds[0]), np.maximum(high, known.bounds[1])
-    where = space(outlines, corners, low, high, cell=vehicle.width / CELLS, margin=margin)
+    where = space(outlines, corners, low, high, cell=vehicle.width / CELLS_PER_WIDTH, margin=margin)
     if around:
         where = wider(where, goal, 3 * radius)
 
@@ -223,7 +229,7 @@ def _planned(
         except InputError as fault:
             check(reference, robot.replace(steering_limit=ANY_ANGLE), reverse)  # wider arcs help the steering alone
             try:
-                found, reference = attempt(GENTLER * radius, arc, curvature)
+                found, reference = attempt(GENTLER_FACTOR * radius, arc, curvature)
                 check(reference, robot, reverse)
             except InputError:
                 raise fault from None

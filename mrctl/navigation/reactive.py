@@ -9,9 +9,9 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
-from mrctl.navigation.chart import RADIUS
-from mrctl.navigation.replanning import RETRY, SHORTER, WAITED, Planner, Replan
-from mrctl.navigation.rollouts import KEPT, STEPS, Bounds, Considered, Scene
+from mrctl.navigation.chart import PLACE_RADIUS
+from mrctl.navigation.replanning import BLOCKED_RETRY, HEADWAY_TIME, SHORTER_SHARE, Planner, Replan
+from mrctl.navigation.rollouts import NEAR_DISTANCE, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
 from mrctl.scenario import Scenario
@@ -21,19 +21,21 @@ from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
-CELL = 0.04  # m, of the distance field
-AROUND = 3.0  # m around the plan, which the field covers
-DISCS = 4, 2  # in a row, and rows, that cover the robot, and reach 4 to 6 cm beyond its nose
-AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
-FINE = 5  # samples of the plan in a motion period
-OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen
-# m, and share of the way at full speed in the time WAITED: a robot makes headway if it covers the smaller one; chosen
-HEADWAY = 0.05, 0.5
-STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
+FIELD_CELL = 0.04  # m, of the distance field
+FIELD_MARGIN = 3.0  # m around the plan, which the field covers
+BODY_DISCS = 4, 2  # in a row, and rows, that cover the robot, and reach 4 to 6 cm beyond its nose
+SEARCHED_SAMPLES = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
+SAMPLES_PER_PERIOD = 5  # samples of the plan in a motion period
+MAX_PLAN_DISTANCE = 0.6  # m from its plan, beyond which a robot makes another one; chosen
+# m, and share of the way at full speed in the time HEADWAY_TIME: a robot makes headway if it covers the smaller one;
+# chosen
+MIN_HEADWAY = 0.05, 0.5
+# s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
+STAY_TIME = 1.0
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
 BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
-PIECES = 10  # largest number of pieces, as far as the `Trail` reaches
-FREE = 0.02  # m, clearance from what is not on the map while it goes back
+MAX_BACK_PIECES = 10  # largest number of pieces, as far as the `Trail` reaches
+BACK_CLEARANCE = 0.02  # m, clearance from what is not on the map while it goes back
 
 
 class Agent:
@@ -70,9 +72,9 @@ class Agent:
         self._approached = False  # whether it has gone back from a goal at which it did not arrive
 
     def _sampled(self, plan: Waypoints) -> Array:
-        """Returns a plan as rows of `Scene.targets`, `FINE` in a motion period."""
-        count = int(np.ceil(plan.period / self._period)) * FINE + 1
-        poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
+        """Returns a plan as rows of `Scene.targets`, `SAMPLES_PER_PERIOD` in a motion period."""
+        count = int(np.ceil(plan.period / self._period)) * SAMPLES_PER_PERIOD + 1
+        poses = plan.sample(self._period / SAMPLES_PER_PERIOD * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
     def follow(self, plan: Reference, now: float) -> None:
@@ -101,13 +103,13 @@ class Agent:
 
     def locate(self, pose: Array) -> None:
         """Finds the place on the plan that is nearest to a pose in m, m, rad, `(3,)`, of those not far ahead."""
-        away = np.hypot(*(self._table[self._place : self._place + AHEAD, :2] - pose[:2]).T)
+        away = np.hypot(*(self._table[self._place : self._place + SEARCHED_SAMPLES, :2] - pose[:2]).T)
         self._place, self._away = self._place + int(away.argmin()), float(away.min())
 
     def scene(self, pose: Array, now: float) -> Scene:
         """Returns what roll-outs from a pose in m, m, rad, `(3,)`, are judged by at a time in s."""
         last = len(self._table) - 1
-        places = self._place + FINE * np.arange(1, STEPS + 1)
+        places = self._place + SAMPLES_PER_PERIOD * np.arange(1, STEPS + 1)
         targets, end = self._table[np.minimum(places, last)], 1 + int(np.searchsorted(places, last))
         found, horizon = self.planner.sight.discs(now), self._period * STEPS
         far = self._reach + horizon * (self._bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
@@ -129,7 +131,7 @@ class Agent:
             self._arrived = np.inf
         elif self._at_end(pose, speed):
             self._arrived = min(self._arrived, now)
-        if stands := now - self._arrived > STAYS:
+        if stands := now - self._arrived > STAY_TIME:
             self.last = np.zeros(2)
         return stands
 
@@ -161,10 +163,10 @@ class Agent:
             if not self.needs_plan(pose, now):
                 self._shorten(pose, now)
                 return False
-            other = self.planner.plan(pose, self.last, now, self._away <= OFF and not self._waits(now))
+            other = self.planner.plan(pose, self.last, now, self._away <= MAX_PLAN_DISTANCE and not self._waits(now))
             # What it got here before did not help it.
-            stuck = self._waits(now) and self._away <= OFF and (other is None or self._replanned)
-        self._replanned = self._waits(now) and self._away <= OFF
+            stuck = self._waits(now) and self._away <= MAX_PLAN_DISTANCE and (other is None or self._replanned)
+        self._replanned = self._waits(now) and self._away <= MAX_PLAN_DISTANCE
         if stuck and self._may_go_back(now):
             self._approached |= self._near_end
             self._pieces = self._pieces + 1 if self._back(pose, now) else 0
@@ -182,10 +184,12 @@ class Agent:
         """
         if self._at_end(pose):
             self.planner.got_on, self.planner.blocked = now, np.inf
-        if self._gone(pose) > min(HEADWAY[0], HEADWAY[1] * WAITED * self._bounds.speed):
+        if self._gone(pose) > min(MIN_HEADWAY[0], MIN_HEADWAY[1] * HEADWAY_TIME * self._bounds.speed):
             self._anchor, self.planner.got_on, self._replanned = pose[:2].copy(), now, False
         blocked = self.planner.is_blocked(now) and not self.passes
-        lost = (blocked or self._away > OFF or self._waits(now)) and now - self.planner.tried > RETRY
+        lost = (
+            blocked or self._away > MAX_PLAN_DISTANCE or self._waits(now)
+        ) and now - self.planner.tried > BLOCKED_RETRY
         lost, self.planner.looked = lost and self.planner.looked, False
         if lost:
             self.planner.tried = now
@@ -193,7 +197,7 @@ class Agent:
 
     def _waits(self, now: float) -> bool:
         """Tells whether it has hardly moved for a while."""
-        return now - self.planner.got_on > WAITED
+        return now - self.planner.got_on > HEADWAY_TIME
 
     def _gone(self, pose: Array) -> float:
         """Returns the distance in m from where it last was when it had got on."""
@@ -202,38 +206,38 @@ class Agent:
     @property
     def _near_end(self) -> bool:
         """Whether its place on the plan is the last one."""
-        return self._place > len(self._table) - 1 - FINE
+        return self._place > len(self._table) - 1 - SAMPLES_PER_PERIOD
 
     def _may_go_back(self, now: float) -> bool:
         """Tells whether it could go back a piece: not where what moves may let it pass, nor twice from a goal."""
         can = self.planner.vehicle.reverses and not len(self.planner.sight.moving(now).discs)
-        return can and self._pieces < PIECES and not (self._near_end and self._approached)
+        return can and self._pieces < MAX_BACK_PIECES and not (self._near_end and self._approached)
 
     def _back(self, pose: Array, now: float) -> bool:
         """Lets `last` be the twist with which it goes back; returns whether it can."""
-        twist = self._trail.back(pose, self.planner.sight.outlines(now, FREE - RADIUS))
+        twist = self._trail.back(pose, self.planner.sight.outlines(now, BACK_CLEARANCE - PLACE_RADIUS))
         if twist is not None:
             self.last = twist
         return twist is not None
 
     def _shorten(self, pose: Array, now: float) -> None:
         """Takes another plan where the map has changed, if that takes less time than the rest of its own."""
-        left = self._period / FINE * (len(self._table) - 1 - self._place)
-        if self.planner.map_changed and now - self.planner.tried > RETRY:
+        left = self._period / SAMPLES_PER_PERIOD * (len(self._table) - 1 - self._place)
+        if self.planner.map_changed and now - self.planner.tried > BLOCKED_RETRY:
             self.planner.tried = now
-            if (other := self.planner.plan(pose, self.last, now)) and other.period < SHORTER * left:
+            if (other := self.planner.plan(pose, self.last, now)) and other.period < SHORTER_SHARE * left:
                 self._take(other)
 
 
 def reach(discs: Array) -> float:
     """Returns how far from the origin of a robot's frame obstacles matter to discs that cover it, `(k, 3)`, in m."""
-    return float((np.hypot(discs[:, 0], discs[:, 1]) + discs[:, 2]).max()) + KEPT
+    return float((np.hypot(discs[:, 0], discs[:, 1]) + discs[:, 2]).max()) + NEAR_DISTANCE
 
 
 def field_around(places: Array, sight: Sight, reach: float) -> Field:
     """Returns the distance from a robot's map, up to its `reach` in m, around places on a plan, `(n, 2)` in m."""
-    low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
-    return near_field(sight.map, low, high, CELL, reach + 2 * CELL)
+    low, high = places.min(axis=0) - FIELD_MARGIN, places.max(axis=0) + FIELD_MARGIN
+    return near_field(sight.map, low, high, FIELD_CELL, reach + 2 * FIELD_CELL)
 
 
 class Reactive(ABC):
@@ -268,7 +272,7 @@ class Reactive(ABC):
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self._planners[0].vehicle.footprint, *DISCS), dict[Hashable, Field]()
+        discs, fields = cover(self._planners[0].vehicle.footprint, *BODY_DISCS), dict[Hashable, Field]()
         for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:

@@ -19,13 +19,14 @@ from mrctl.theory.references import Reference, Waypoints
 
 # m, rad and m, within which robot and obstacles are where they were when there was no way: more than the noise, and
 # more than half the distance of the discs that a scan shows. Chosen.
-SAME = 0.02, 0.05, 0.06
-AGAIN = 3.0  # s, after which a search that found no way is repeated in any case
-SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
-SURE = 0.3  # s for which a plan must be blocked by what stands: what moves seems to stand at first; chosen
-WAITED = 1.0  # s without headway, after which a robot makes another plan; chosen
-RETRY = 1.0  # s, least time between two searches for a way around what blocks a plan; chosen
-SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
+UNCHANGED_WITHIN = 0.02, 0.05, 0.06
+FAILED_RETRY = 3.0  # s, after which a search that found no way is repeated in any case
+CHECK_SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
+BLOCKED_TIME = 0.3  # s for which a plan must be blocked by what stands: what moves seems to stand at first; chosen
+HEADWAY_TIME = 1.0  # s without headway, after which a robot makes another plan; chosen
+BLOCKED_RETRY = 1.0  # s, least time between two searches for a way around what blocks a plan; chosen
+# a plan since the map has changed is taken if it needs less than this share of the time that is left
+SHORTER_SHARE = 0.9
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
 """Plans for the mission of a scenario with its robot, from a pose in m, m, rad, `(3,)`, and a twist in m/s and rad/s,
@@ -53,7 +54,7 @@ def blocked_at(footprint: Array, poses: Array, way: Array, outlines: Outlines) -
         way: Length in m of the way up to each pose, `(k,)`; poses about 5 cm apart are looked at.
         outlines: The obstacles.
     """
-    for k in np.searchsorted(way, np.arange(0.0, way[-1], SPACING)):
+    for k in np.searchsorted(way, np.arange(0.0, way[-1], CHECK_SPACING)):
         if clearance(footprint, poses[k], outlines) <= 0:
             return int(k)
     return None
@@ -73,7 +74,7 @@ class Planner:
             it does not.
         got_on: Time in s from which its waiting counts: when it last made headway, had no reason to, or looked for
             another plan because it had waited.
-        tried: Time in s of the last search from which `RETRY` counts; −∞ where the next one need not wait.
+        tried: Time in s of the last search from which `BLOCKED_RETRY` counts; −∞ where the next one need not wait.
     """
 
     def __init__(self, replan: Replan, scenario: Scenario, sight: Sight, vehicle: Vehicle) -> None:
@@ -133,7 +134,7 @@ class Planner:
 
     def is_blocked(self, now: float) -> bool:
         """Tells whether its plan has been blocked for so long, at a time in s, that it is no passing finding."""
-        return now - self.blocked >= SURE
+        return now - self.blocked >= BLOCKED_TIME
 
     @property
     def goal(self) -> Pose | None:
@@ -160,7 +161,7 @@ class Planner:
         near, far = self.sight.outlines(time), self.sight.around(time, self.vehicle.footprint, pose)
         if self._hopeless:
             since, there, known = self._hopeless
-            if time - since < AGAIN and _same(there, known, pose, near):
+            if time - since < FAILED_RETRY and _same(there, known, pose, near):
                 return None
         for outlines in (near,) if np.array_equal(near.discs, far.discs) else (far, near):
             try:
@@ -174,15 +175,15 @@ class Planner:
 
 
 def _same(pose: Array, before: Outlines, now: Array, after: Outlines) -> bool:
-    """Tells whether pose and obstacles are the same within `SAME`, the radii of discs included."""
+    """Tells whether pose and obstacles are the same within `UNCHANGED_WITHIN`, the radii of discs included."""
     turn = np.angle(np.exp(1j * (now[2] - pose[2])))
     if (
-        np.hypot(*(now[:2] - pose[:2])) > SAME[0]
-        or abs(turn) > SAME[1]
+        np.hypot(*(now[:2] - pose[:2])) > UNCHANGED_WITHIN[0]
+        or abs(turn) > UNCHANGED_WITHIN[1]
         or not np.array_equal(before.edges, after.edges)
     ):
         return False
     if not (len(before.discs) and len(after.discs)):
         return len(before.discs) == len(after.discs)
     away = np.linalg.norm(before.discs[:, None] - after.discs, axis=2)
-    return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= SAME[2])
+    return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= UNCHANGED_WITHIN[2])

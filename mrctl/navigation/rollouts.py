@@ -15,14 +15,15 @@ import numpy as np
 from mrctl.kernel import Array, kernel
 from mrctl.theory.grid import Field, value
 from mrctl.theory.robot import Robot
-from mrctl.theory.timing import RESERVE
+from mrctl.theory.timing import LIMIT_SHARE
 
 STEPS = 56  # of a roll-out, each a motion period
 KNOTS = 8  # of a roll-out, between which what is added to its twists changes linearly
-PLACE, HEADING, NEAR, TOUCH = 10.0, 1.0, 5.0, 1000.0  # costs in 1/(m² s), 1/s, 1/s and for a collision; chosen
-HEADING_AT_END = 5.0  # 1/s, where the plan has ended: 0.2 rad cost what 0.1 m do, as by `arrived`
-KEPT = 0.1  # m from obstacles, below which it costs
-DEEPER = 0.005  # m, by which discs that touch an obstacle already may come nearer
+# costs in 1/(m² s), 1/s, 1/s and for a collision; chosen
+PLACE_COST, HEADING_COST, NEAR_COST, TOUCH_COST = 10.0, 1.0, 5.0, 1000.0
+END_HEADING_COST = 5.0  # 1/s, where the plan has ended: 0.2 rad cost what 0.1 m do, as by `arrived`
+NEAR_DISTANCE = 0.1  # m from obstacles, below which it costs
+MAX_DEEPER = 0.005  # m, by which discs that touch an obstacle already may come nearer
 
 
 class Bounds(NamedTuple):
@@ -47,9 +48,9 @@ class Bounds(NamedTuple):
             robot: The robot.
             speed: Largest V in m/s, which stays as it is.
         """
-        curvature = float(np.tan(RESERVE * robot.steering_limit)) / abs(robot.wheelbase)
-        rates = robot.max_rotation, curvature / RESERVE, robot.max_acceleration, robot.max_rotation_acceleration
-        return cls(speed, *(RESERVE * limit for limit in rates))
+        curvature = float(np.tan(LIMIT_SHARE * robot.steering_limit)) / abs(robot.wheelbase)
+        rates = robot.max_rotation, curvature / LIMIT_SHARE, robot.max_acceleration, robot.max_rotation_acceleration
+        return cls(speed, *(LIMIT_SHARE * limit for limit in rates))
 
 
 class Scene(NamedTuple):
@@ -66,8 +67,8 @@ class Scene(NamedTuple):
     """Discs around the others that it has seen: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
     end: int = STEPS
     """Number of targets up to the end of the plan; all later ones are that end, at which the heading costs more."""
-    near: float = NEAR
-    """Cost in 1/s of touching an obstacle; it falls to zero at `KEPT`."""
+    near: float = NEAR_COST
+    """Cost in 1/s of touching an obstacle; it falls to zero at `NEAR_DISTANCE`."""
 
 
 class Considered(NamedTuple):
@@ -103,7 +104,7 @@ def body_clearance(
     x: float, y: float, c: float, s: float, time: float, circle: tuple[float, float, float], discs: Array,
     distance: Array, left: float, low: float, resolution: float, movers: Array,
 ) -> float:  # fmt: skip
-    """Returns the distance in m of the discs of a robot from all that it knows, or `KEPT` where it is larger.
+    """Returns the distance in m of the discs of a robot from all that it knows, or `NEAR_DISTANCE` where it is larger.
 
     Args:
         x: x of the robot in m.
@@ -119,9 +120,9 @@ def body_clearance(
         resolution: Side of its cells in m.
         movers: `Scene.movers`.
     """
-    free, far = KEPT, circle[2] + KEPT
+    free, far = NEAR_DISTANCE, circle[2] + NEAR_DISTANCE
     px, py = x + c * circle[0] - s * circle[1], y + s * circle[0] + c * circle[1]
-    if value(distance, left, low, resolution, px, py) < far:  # else no disc can be nearer than KEPT
+    if value(distance, left, low, resolution, px, py) < far:  # else no disc can be nearer than NEAR_DISTANCE
         for d in range(len(discs)):
             px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
             free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
@@ -171,7 +172,7 @@ def roll_out(
     # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
     x, y, c, s = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2])
     least = body_clearance(x, y, c, s, 0.0, circle, discs, distance, left, low, resolution, movers)
-    least = least - DEEPER if least <= 0 else 0.0
+    least = least - MAX_DEEPER if least <= 0 else 0.0
     # While a request is held, what is missing of it decays: to `rest` at the end of a step, to `mean` on its average.
     rest = np.exp(-step / lag) if lag > 0 else 0.0
     mean = (1 - rest) * lag / step
@@ -183,7 +184,7 @@ def roll_out(
     cheapest = np.inf
     for n in range(len(knots)):
         x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), last[0], last[1], 0.0
-        drives, turns, judged, free = twist[0], twist[1], False, KEPT
+        drives, turns, judged, free = twist[0], twist[1], False, NEAR_DISTANCE
         for k in range(steps):
             i, share = before[k], shares[k]
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
@@ -206,17 +207,17 @@ def roll_out(
             x, y = x + speed * step * c, y + speed * step * s
             c, s = c * ch - s * sh, s * ch + c * sh
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
-            turned = (HEADING if k < end else HEADING_AT_END) * (1 - c * targets[k, 2] - s * targets[k, 3])
-            cost += step * (PLACE * (dx * dx + dy * dy) + turned)
+            turned = (HEADING_COST if k < end else END_HEADING_COST) * (1 - c * targets[k, 2] - s * targets[k, 3])
+            cost += step * (PLACE_COST * (dx * dx + dy * dy) + turned)
             if k == 0 or speed != 0.0 or rotation != 0.0 or len(movers) > 0:  # else it rests, and so does all around it
                 free = body_clearance(
                     x, y, c, s, (k + 1) * step, circle, discs, distance, left, low, resolution, movers
                 )
             if free <= least:
                 judged = True
-                cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse
-            elif free < KEPT:
-                cost += step * near * (1 - free / KEPT) ** 2
+                cost += TOUCH_COST * (1 + (steps - k) / steps)  # the earlier, the worse
+            elif free < NEAR_DISTANCE:
+                cost += step * near * (1 - free / NEAR_DISTANCE) ** 2
             judged |= cost > cheapest + worth
         costs[n] = cost
         cheapest = min(cheapest, cost)

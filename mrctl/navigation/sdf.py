@@ -12,7 +12,7 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.record import InputError, read_file
-from mrctl.theory.obstacles import FLAT, OVERHEAD, Obstacles, turned
+from mrctl.theory.obstacles import GROUND_HEIGHT, OVERHEAD_HEIGHT, Obstacles, turned
 
 
 def read_sdf(path: str | Path) -> Obstacles:
@@ -105,11 +105,11 @@ def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]
     except (ValueError, IndexError):
         raise InputError(f"{name}: {shape.tag} has no valid {field}") from None
     half = size[2] / 2 if shape.tag == "box" else length / 2
-    if pose[2] + half <= FLAT:
+    if pose[2] + half <= GROUND_HEIGHT:
         return []
     if shape.tag != "sphere" and np.abs(pose[3:5]).max() > 1e-3:
         raise InputError(f"{name}: is not upright")
-    if pose[2] - half >= OVERHEAD:
+    if pose[2] - half >= OVERHEAD_HEIGHT:
         return []
     x, y, yaw = (float(value) for value in pose[[0, 1, 5]])
     if shape.tag == "box":

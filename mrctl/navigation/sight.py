@@ -23,25 +23,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
-from mrctl.navigation.chart import BESIDE, FAR, LEAST, RADIUS, Chart, reached, through
+from mrctl.navigation.chart import MAX_FAR_OFFSET, MAX_OFFSET, MIN_POINTS, PLACE_RADIUS, Chart, reached, through
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import Field, at, map_area, near_field
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
 from mrctl.theory.rays import Scan
 
-GAP = 0.3  # m between two points of a cluster, at most
-SPACING = 0.1  # m, of the discs along a cluster; their RADIUS covers the noise of the lidar
-GATE = 0.5  # m between the centre of a cluster and where it was expected, at most
-SMOOTH = 0.15  # s, τ; chosen
-PAST, APART = 1.0, 0.1  # s, in which the place of a cluster must have been empty if it moves; between two such scans
-EMPTY = 0.3  # share of its points at which it must have been
-SLOW = 0.1  # m/s, below which a cluster stands
-HIDDEN = 1.0  # s, for which a cluster, and a disc that moves, is remembered
+CLUSTER_GAP = 0.3  # m between two points of a cluster, at most
+DISC_SPACING = 0.1  # m, of the discs along a cluster; their PLACE_RADIUS covers the noise of the lidar
+MATCHING_DISTANCE = 0.5  # m between the centre of a cluster and where it was expected, at most
+SMOOTHING_TIME = 0.15  # s, τ; chosen
+# s, in which the place of a cluster must have been empty if it moves; between two such scans
+EMPTY_TIME, EMPTY_INTERVAL = 1.0, 0.1
+EMPTY_SHARE = 0.3  # share of its points at which it must have been
+STANDING_SPEED = 0.1  # m/s, below which a cluster stands
+MEMORY = 1.0  # s, for which a cluster, and a disc that moves, is remembered
 # m: extra margin of a new plan around what is not on the map. Where the robot is nearer already, the margin is its
-# clearance less LEFT. Chosen.
-ROUND, LEFT = 0.13, 0.03
-NOTHING = Surroundings(Obstacles()).at(0.0)
+# clearance less KEPT_CLEARANCE. Chosen.
+UNMAPPED_MARGIN, KEPT_CLEARANCE = 0.13, 0.03
+NOTHING_SEEN = Surroundings(Obstacles()).at(0.0)
 
 
 class Cluster(NamedTuple):
@@ -71,7 +72,7 @@ class Sight:
         self._chart, self._field = Chart(known), field
         if field is None and known.shapes:
             low, high, cell = map_area(known)
-            self._field = near_field(self._chart.known, low, high, cell, FAR + 2 * cell)
+            self._field = near_field(self._chart.known, low, high, cell, MAX_FAR_OFFSET + 2 * cell)
         self.forget()
 
     @classmethod
@@ -88,7 +89,7 @@ class Sight:
         self._found = np.zeros((0, 5))  # discs: x, y, their velocities, and when they were seen
         self._clusters: list[Cluster] = []
         self._scans: list[Scan] = []
-        self.standing = NOTHING
+        self.standing = NOTHING_SEEN
         self._chart.forget()
 
     @property
@@ -98,30 +99,30 @@ class Sight:
 
     def see(self, scan: Scan) -> bool:
         """Takes a scan; returns whether the map has changed."""
-        time, past = scan.time, [other for other in self._scans if scan.time - other.time < PAST + 1e-9]
-        if not past or time - past[-1].time > APART - 1e-9:
+        time, past = scan.time, [other for other in self._scans if scan.time - other.time < EMPTY_TIME + 1e-9]
+        if not past or time - past[-1].time > EMPTY_INTERVAL - 1e-9:
             past.append(scan)
         self._scans = past
         before, now, discs = list(self._clusters), [], [np.zeros((0, 5))]
         for points, whole in self._unknown(scan):
             centre, velocity = points.mean(axis=0), np.zeros(2)
             was_empty = np.any([through(points, other) for other in past], axis=0)
-            moves = bool(was_empty.mean() >= EMPTY)
+            moves = bool(was_empty.mean() >= EMPTY_SHARE)
             expected = [c.centre + (time - c.time) * c.velocity for c in before]
             away = [float(np.hypot(*(centre - there))) for there in expected]
-            if away and min(away) < GATE:
+            if away and min(away) < MATCHING_DISTANCE:
                 same = int(np.argmin(away))
                 old = before.pop(same)  # each is found again at most once
                 velocity = old.velocity
                 if whole and old.whole:
-                    velocity = velocity + (centre - expected[same]) / (SMOOTH + time - old.time)
+                    velocity = velocity + (centre - expected[same]) / (SMOOTHING_TIME + time - old.time)
                 moves |= old.moves
-            moves &= bool(np.hypot(velocity[0], velocity[1]) >= SLOW)
+            moves &= bool(np.hypot(velocity[0], velocity[1]) >= STANDING_SPEED)
             now.append(Cluster(centre, velocity, time, moves, whole))
             own = velocity if moves else np.zeros(2)
             discs.append(np.array([(*point, *own, time) for point in _thinned(points)]))
         new = np.concatenate(discs)
-        self._clusters = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
+        self._clusters = now + [cluster for cluster in before if time - cluster.time < MEMORY]
         self._found = found = np.concatenate([new, self._hidden(self._found, new, scan)])
         self.standing = _outlines(found[~_moves(found)])
         return self._chart.see(scan)
@@ -136,12 +137,12 @@ class Sight:
             x and y in m, velocities along x and y in m/s and radius in m, `(M, 5)`.
         """
         found = self._found
-        return np.column_stack([_placed(found, time), found[:, 2:4], np.full(len(found), RADIUS)])
+        return np.column_stack([_placed(found, time), found[:, 2:4], np.full(len(found), PLACE_RADIUS)])
 
     def moving(self, time: float) -> Outlines:
         """Returns those finds that move, where they would be at a time in s."""
         moving = self._found[_moves(self._found)]
-        return _outlines(_placed(moving, time)) if len(moving) else NOTHING
+        return _outlines(_placed(moving, time)) if len(moving) else NOTHING_SEEN
 
     def outlines(self, time: float, margin: float = 0.0) -> Outlines:
         """Returns the map and the finds at a time in s; the finds are enlarged by a margin in m."""
@@ -156,8 +157,8 @@ class Sight:
             footprint: Corners of the robot in its frame in m, `(n, 2)`.
             pose: x and y in m and θ in rad, from which it plans, `(3,)`.
         """
-        left = clearance(footprint, pose, self.standing) - LEFT
-        return self.outlines(time, min(ROUND, max(0.0, left)))
+        left = clearance(footprint, pose, self.standing) - KEPT_CLEARANCE
+        return self.outlines(time, min(UNMAPPED_MARGIN, max(0.0, left)))
 
     def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
         """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether the lidar sees its whole front.
@@ -170,11 +171,11 @@ class Sight:
         if self._field is not None:
             away = np.empty(len(points))
             from_map.compiled(self._field, points, away)
-            beside = away > np.minimum(BESIDE[0] + BESIDE[1] * ranges[met], FAR)
+            beside = away > np.minimum(MAX_OFFSET[0] + MAX_OFFSET[1] * ranges[met], MAX_FAR_OFFSET)
             met, points = met[beside], points[beside]
         if not len(met):
             return []
-        near = np.hypot(*(points - np.roll(points, 1, axis=0)).T) < GAP + 2 * scan.step * ranges[met]
+        near = np.hypot(*(points - np.roll(points, 1, axis=0)).T) < CLUSTER_GAP + 2 * scan.step * ranges[met]
         joined = near & ((met - np.roll(met, 1)) % len(ranges) <= 2)  # with the point before; the first with the last
         first = np.flatnonzero(~joined)
         if len(first):
@@ -183,8 +184,8 @@ class Sight:
         for part in np.split(np.arange(len(met)), first[1:] - first[0] if len(first) else []):
             ends = met[part[[0, -1]]]
             beyond = ranges[(ends + [-1, 1]) % len(ranges)]
-            found.append((points[part], bool(np.all(beyond > ranges[ends] - GAP))))
-        return [(part, whole) for part, whole in found if len(part) >= LEAST]
+            found.append((points[part], bool(np.all(beyond > ranges[ends] - CLUSTER_GAP))))
+        return [(part, whole) for part, whole in found if len(part) >= MIN_POINTS]
 
     def _hidden(self, old: Array, new: Array, scan: Scan) -> Array:
         """Returns the old discs, `(k, 5)`, that the scan neither shows nor sees through.
@@ -194,10 +195,10 @@ class Sight:
         if not len(old):
             return old
         places, moves = _placed(old, scan.time), _moves(old)
-        gone = through(places, scan) | (moves & (scan.time - old[:, 4] > HIDDEN))
+        gone = through(places, scan) | (moves & (scan.time - old[:, 4] > MEMORY))
         if len(new):
-            near = np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
-            gone |= near & (moves | reached(places, scan, 2 * SPACING))
+            near = np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * DISC_SPACING
+            gone |= near & (moves | reached(places, scan, 2 * DISC_SPACING))
         return _apart(old[~gone])
 
 
@@ -220,21 +221,21 @@ def _moves(discs: Array) -> NDArray[np.bool]:
 
 def _outlines(places: Array) -> Outlines:
     """Returns discs around places, x and y in m first, as outlines."""
-    return NOTHING._replace(discs=np.column_stack([places[:, :2], np.full(len(places), RADIUS)]))
+    return NOTHING_SEEN._replace(discs=np.column_stack([places[:, :2], np.full(len(places), PLACE_RADIUS)]))
 
 
 def _apart(discs: Array) -> Array:
-    """Returns discs, `(k, 5)`, each at least half of `SPACING` from those of them that were seen earlier."""
+    """Returns discs, `(k, 5)`, each at least half of `DISC_SPACING` from those of them that were seen earlier."""
     kept = np.zeros(len(discs), bool)
     for k in np.argsort(discs[:, 4], kind="stable"):
-        kept[k] = not kept.any() or np.hypot(*(discs[kept, :2] - discs[k, :2]).T).min() >= SPACING / 2
+        kept[k] = not kept.any() or np.hypot(*(discs[kept, :2] - discs[k, :2]).T).min() >= DISC_SPACING / 2
     return discs[kept]
 
 
 def _thinned(points: Array) -> Array:
-    """Returns points of a row of them, `(n, 2)` in m, that are at least `SPACING` apart, beginning with the first."""
+    """Returns points of a row of them, `(n, 2)` in m, at least `DISC_SPACING` apart, beginning with the first."""
     kept = [0]
     for k in range(1, len(points)):
-        if np.hypot(*(points[k] - points[kept[-1]])) >= SPACING:
+        if np.hypot(*(points[k] - points[kept[-1]])) >= DISC_SPACING:
             kept.append(k)
     return points[kept]

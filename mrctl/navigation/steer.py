@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
 
-PIECES = 5
-CHECK = 0.05  # m, largest distance of the poses on a way, which are held against the obstacles
-QUARTER = np.pi / 2
-TINY = 1e-10  # a shorter arc or line, or one that is by as much negative, is rounding; for radius 1
+MAX_PIECES = 5
+CHECK_SPACING = 0.05  # m, largest distance of the poses on a way, which are held against the obstacles
+QUARTER_TURN = np.pi / 2
+MIN_PIECE = 1e-10  # a shorter arc or line, or one that is by as much negative, is rounding; for radius 1
 TURNS = np.array(
     [
         (1, 0, 1, 0, 0), (1, 0, -1, 0, 0), (1, -1, 1, 0, 0), (1, -1, 1, 0, 0), (1, -1, 1, -1, 0), (1, -1, 1, -1, 0),
@@ -26,8 +26,8 @@ TURNS = np.array(
     ],
     float,
 )  # fmt: skip
-FORMULA = np.array([1, 2, 3, 3, 7, 8, 9, 10, 9, 10, 11])  # the last part of its number in the paper, 8.1 to 8.11
-BACKWARDS = np.array([0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0])  # whether the word is read from its end
+FORMULAS = np.array([1, 2, 3, 3, 7, 8, 9, 10, 9, 10, 11])  # the last part of its number in the paper, 8.1 to 8.11
+READ_BACKWARDS = np.array([0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0])  # whether the word is read from its end
 DUBINS_TURNS = np.array([(1, 0, 1), (-1, 0, -1), (1, 0, -1), (-1, 0, 1), (-1, 1, -1), (1, -1, 1)], float)
 
 
@@ -54,7 +54,7 @@ def steer(start: Array, goal: Array, radius: float, reverse: bool) -> Curve:
         radius: Least turning radius in m.
         reverse: Whether the robot may reverse.
     """
-    found = Curve(np.zeros(PIECES), np.zeros(PIECES))
+    found = Curve(np.zeros(MAX_PIECES), np.zeros(MAX_PIECES))
     shortest.compiled(np.asarray(start, float), np.asarray(goal, float), float(radius), reverse, *found)
     return found
 
@@ -66,7 +66,7 @@ def shortest(start: Array, goal: Array, radius: float, reverse: bool, turns: Arr
     dx, dy = (goal[0] - start[0]) / radius, (goal[1] - start[1]) / radius
     x, y, phi = c * dx + s * dy, c * dy - s * dx, wrap(goal[2] - start[2])
     total = reeds_shepp(x, y, phi, turns, lengths) if reverse else dubins(x, y, phi, turns, lengths)
-    for k in range(PIECES):
+    for k in range(MAX_PIECES):
         lengths[k] *= radius
     return radius * total
 
@@ -81,7 +81,7 @@ def wrap(angle: float) -> float:
 def positive(angle: float) -> float:
     """Returns an angle in rad between 0 and 2π; one that rounding put just below a whole turn is 0."""
     found = angle - 2 * np.pi * np.floor(angle / (2 * np.pi))
-    return 0.0 if found > 2 * np.pi - TINY else found
+    return 0.0 if found > 2 * np.pi - MIN_PIECE else found
 
 
 @kernel
@@ -107,12 +107,12 @@ def dubins(x: float, y: float, phi: float, turns: Array, lengths: Array) -> floa
         t = p = q = 0.0
         if k == 0:  # left, straight, left
             square, e = 2 + d * d - 2 * cab + 2 * d * (sa - sb), np.arctan2(cb - ca, d + sa - sb)
-            if np.hypot(cb - ca, d + sa - sb) < TINY:  # a single arc, for the line has no direction
+            if np.hypot(cb - ca, d + sa - sb) < MIN_PIECE:  # a single arc, for the line has no direction
                 square, e = 0.0, a
             t, q = e - a, b - e
         elif k == 1:
             square, e = 2 + d * d - 2 * cab + 2 * d * (sb - sa), np.arctan2(ca - cb, d - sa + sb)
-            if np.hypot(ca - cb, d - sa + sb) < TINY:
+            if np.hypot(ca - cb, d - sa + sb) < MIN_PIECE:
                 square, e = 0.0, a
             t, q = a - e, e - b
         elif k == 2:
@@ -157,35 +157,35 @@ def reeds_shepp(x: float, y: float, phi: float, turns: Array, lengths: Array) ->
     """
     best = np.inf
     turns[:] = lengths[:] = 0.0
-    piece = np.zeros(PIECES)
+    piece = np.zeros(MAX_PIECES)
     for k in range(len(TURNS)):
         for image in range(4):
             way, side = 1.0 - 2 * (image % 2), 1.0 - 2 * (image // 2)
             px, py, angle = way * x, side * y, way * side * phi
-            if BACKWARDS[k]:
+            if READ_BACKWARDS[k]:
                 px, py = px * np.cos(angle) + py * np.sin(angle), px * np.sin(angle) - py * np.cos(angle)
-            valid, t, u, v = word(FORMULA[k], px, py, angle)
+            valid, t, u, v = word(FORMULAS[k], px, py, angle)
             if not valid:
                 continue
             piece[:] = 0.0
-            number = FORMULA[k]
+            number = FORMULAS[k]
             if number <= 3:
                 piece[0], piece[1], piece[2] = t, u, v
             elif number <= 8:
                 piece[0], piece[1], piece[2], piece[3] = t, u, -u if number == 7 else u, v
             elif number <= 10:
-                piece[0], piece[1], piece[2], piece[3] = t, -QUARTER, u, v
+                piece[0], piece[1], piece[2], piece[3] = t, -QUARTER_TURN, u, v
             else:
-                piece[0], piece[1], piece[2], piece[3], piece[4] = t, -QUARTER, u, -QUARTER, v
-            for n in range(PIECES):
-                if abs(piece[n]) < TINY:
+                piece[0], piece[1], piece[2], piece[3], piece[4] = t, -QUARTER_TURN, u, -QUARTER_TURN, v
+            for n in range(MAX_PIECES):
+                if abs(piece[n]) < MIN_PIECE:
                     piece[n] = 0.0
             total = np.abs(piece).sum()
             if total < best:
                 best = total
                 last = 2 if number == 3 else 3
-                for n in range(PIECES):
-                    source = last - n if BACKWARDS[k] and n <= last else n
+                for n in range(MAX_PIECES):
+                    source = last - n if READ_BACKWARDS[k] and n <= last else n
                     lengths[n], turns[n] = way * piece[source], side * TURNS[k, n]
     return best
 
@@ -194,7 +194,7 @@ def reeds_shepp(x: float, y: float, phi: float, turns: Array, lengths: Array) ->
 def word(number: int, x: float, y: float, phi: float) -> tuple[bool, float, float, float]:
     """Solves the equations of one word for its lengths t, u and v; the first value tells whether it has them.
 
-    A length of the wrong sign that is `TINY` counts as 0.
+    A length of the wrong sign that is `MIN_PIECE` counts as 0.
     """
     s, c = np.sin(phi), np.cos(phi)
     same = number in (1, 3, 9)  # first and last turn to the same side
@@ -202,55 +202,55 @@ def word(number: int, x: float, y: float, phi: float) -> tuple[bool, float, floa
     rho, theta = np.hypot(xi, eta), np.arctan2(eta, xi)
     t = u = v = 0.0
     if number == 1:  # L+ S+ L+
-        t, u = theta if rho > TINY else 0.0, rho  # where there is no line, theta is noise
+        t, u = theta if rho > MIN_PIECE else 0.0, rho  # where there is no line, theta is noise
         v = wrap(phi - t)
-        return t >= -TINY and v >= -TINY, t, u, v
+        return t >= -MIN_PIECE and v >= -MIN_PIECE, t, u, v
     if number == 2:  # L+ S+ R+
-        if rho < 2 - TINY:
+        if rho < 2 - MIN_PIECE:
             return False, t, u, v
         u = np.sqrt(max(rho * rho - 4, 0.0))
         t = wrap(theta + np.arctan2(2.0, u))
         v = wrap(t - phi)
-        return t >= -TINY and v >= -TINY, t, u, v
+        return t >= -MIN_PIECE and v >= -MIN_PIECE, t, u, v
     if number == 3:  # L+ R− L
         if rho > 4:
             return False, t, u, v
         u = -2 * np.arcsin(rho / 4)
         t = wrap(theta + u / 2 + np.pi)
         v = wrap(phi - t + u)
-        return t >= -TINY and u <= TINY, t, u, v
+        return t >= -MIN_PIECE and u <= MIN_PIECE, t, u, v
     if number == 7:  # L+ R+ L− R−
         cosine = (2 + rho) / 4
         if cosine > 1:
             return False, t, u, v
         u = np.arccos(cosine)
         t, v = ends(u, -u, xi, eta, phi)
-        return t >= -TINY and v <= TINY, t, u, v
+        return t >= -MIN_PIECE and v <= MIN_PIECE, t, u, v
     if number == 8:  # L+ R− L− R+
         cosine = (20 - rho * rho) / 16
         if not 0 <= cosine <= 1:
             return False, t, u, v
         u = -np.arccos(cosine)
         t, v = ends(u, u, xi, eta, phi)
-        return t >= -TINY and v >= -TINY, t, u, v
+        return t >= -MIN_PIECE and v >= -MIN_PIECE, t, u, v
     if rho < 2:
         return False, t, u, v
     if number == 9:  # L+ R− S− L−
         r = np.sqrt(rho * rho - 4)
         u = 2 - r
         t = wrap(theta + np.arctan2(r, -2.0))
-        v = wrap(phi - QUARTER - t)
-        return t >= -TINY and u <= TINY and v <= TINY, t, u, v
+        v = wrap(phi - QUARTER_TURN - t)
+        return t >= -MIN_PIECE and u <= MIN_PIECE and v <= MIN_PIECE, t, u, v
     if number == 10:  # L+ R− S− R−
         t, u = np.arctan2(xi, -eta), 2 - rho
-        v = wrap(t + QUARTER - phi)
-        return t >= -TINY and u <= TINY and v <= TINY, t, u, v
+        v = wrap(t + QUARTER_TURN - phi)
+        return t >= -MIN_PIECE and u <= MIN_PIECE and v <= MIN_PIECE, t, u, v
     u = 4 - np.sqrt(rho * rho - 4)  # L+ R− S− L− R+
-    if u > TINY:
+    if u > MIN_PIECE:
         return False, t, u, v
     t = wrap(np.arctan2((4 - u) * xi - 2 * eta, -2 * xi + (u - 4) * eta))
     v = wrap(t - phi)
-    return t >= -TINY and v >= -TINY, t, u, v
+    return t >= -MIN_PIECE and v >= -MIN_PIECE, t, u, v
 
 
 @kernel

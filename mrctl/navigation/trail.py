@@ -16,9 +16,10 @@ from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 
 # All values are chosen.
-PLACES, SPACING = 200, 0.02  # number of places that are remembered, and the least distance of two of them in m
-LOOK = 0.2  # distance in m of the place behind the robot to which it steers
-BEHIND = 0.1  # distance in m behind the robot within which it looks for obstacles
+# number of places that are remembered, and the least distance of two of them in m
+MAX_PLACES, PLACE_SPACING = 200, 0.02
+LOOKAHEAD = 0.2  # distance in m of the place behind the robot to which it steers
+CHECKED_BEHIND = 0.1  # distance in m behind the robot within which it looks for obstacles
 
 
 class Trail:
@@ -33,11 +34,11 @@ class Trail:
             curvature: Largest |θ̇| / |V| in 1/m.
         """
         self._footprint, self._speed, self._curvature = footprint, speed, curvature
-        self._places = deque[Array](maxlen=PLACES)
+        self._places = deque[Array](maxlen=MAX_PLACES)
 
     def add(self, pose: Array) -> None:
         """Remembers where the robot is, x and y in m and θ in rad, `(3,)`."""
-        if not self._places or np.hypot(*(pose[:2] - self._places[-1])) > SPACING:
+        if not self._places or np.hypot(*(pose[:2] - self._places[-1])) > PLACE_SPACING:
             self._places.append(pose[:2].copy())
 
     def back(self, pose: Array, outlines: Outlines) -> Array | None:
@@ -50,13 +51,13 @@ class Trail:
         Returns:
             The twist, or None at the beginning of the trail, or where the robot would touch an obstacle.
         """
-        while self._places and np.hypot(*(pose[:2] - self._places[-1])) < LOOK:
+        while self._places and np.hypot(*(pose[:2] - self._places[-1])) < LOOKAHEAD:
             self._places.pop()
         if not self._places:
             return None
         c, s = np.cos(pose[2]), np.sin(pose[2])
         x, y = np.array([[c, s], [-s, c]]) @ (self._places[-1] - pose[:2])
         curvature = np.clip(2 * y / (x * x + y * y), -self._curvature, self._curvature)
-        if clearance(self._footprint, pose - BEHIND * np.array([c, s, curvature]), outlines) <= 0:
+        if clearance(self._footprint, pose - CHECKED_BEHIND * np.array([c, s, curvature]), outlines) <= 0:
             return None
         return -self._speed * np.array([1.0, curvature])

@@ -13,15 +13,16 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.navigation.reactive import Reactive
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Scene, roll_out
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH_COST, Considered, Scene, roll_out
 
-SPEEDS, ROTATIONS = 9, 15  # of the window
-MOMENT = 0.25  # s, in which the twists of the window can be reached
-LOOK = 12  # steps, over which a constant twist is looked at; chosen, like the next two
-NEARNESS = 1.25  # 1/s, `Scene.near`; with more a robot stops before gaps, as it comes nearer to its plan so slowly
+SPEED_SAMPLES, ROTATION_SAMPLES = 9, 15  # of the window
+REACH_TIME = 0.25  # s, in which the twists of the window can be reached
+LOOK_STEPS = 12  # steps, over which a constant twist is looked at; chosen, like the next two
+# 1/s, `Scene.near`; with more a robot stops before gaps, as it comes nearer to its plan so slowly
+NEARNESS_WEIGHT = 1.25
 # m, by which what the robot has found beside its map is enlarged: a roll-out neither knows the noise of the lidar, nor
 # how the robot departs from the twist, nor the side of an obstacle that no scan has shown yet. Chosen.
-RESERVE = 0.05
+UNMAPPED_MARGIN = 0.05
 
 
 class Window(Reactive):
@@ -30,26 +31,30 @@ class Window(Reactive):
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first twist towards the best one of the window."""
         bounds = self.bounds[row]
-        reach, turn = MOMENT * bounds.acceleration, MOMENT * bounds.rotation_acceleration
-        speeds = np.linspace(max(0.0, last[0] - reach), min(bounds.speed, last[0] + reach), SPEEDS)
-        rotations = np.linspace(max(-bounds.rotation, last[1] - turn), min(bounds.rotation, last[1] + turn), ROTATIONS)
+        reach, turn = REACH_TIME * bounds.acceleration, REACH_TIME * bounds.rotation_acceleration
+        speeds = np.linspace(max(0.0, last[0] - reach), min(bounds.speed, last[0] + reach), SPEED_SAMPLES)
+        rotations = np.linspace(
+            max(-bounds.rotation, last[1] - turn), min(bounds.rotation, last[1] + turn), ROTATION_SAMPLES
+        )
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
-        ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
+        ahead, costs = np.empty((len(grid), LOOK_STEPS, 2)), np.empty(len(grid))
         # A constant twist would rather stop before the goal than be turned there.
-        scene = scene._replace(end=STEPS, near=NEARNESS)
-        near = scene._replace(targets=scene.targets[:LOOK])
-        roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs)
+        scene = scene._replace(end=STEPS, near=NEARNESS_WEIGHT)
+        near = scene._replace(targets=scene.targets[:LOOK_STEPS])
+        roll_out.compiled(
+            constant, rest[:LOOK_STEPS], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs
+        )
         stops, braking, wide = np.empty((len(grid), STEPS, 2)), np.empty(len(grid)), np.empty(len(grid))
         falling = constant * np.array([1.0, *[0.0] * (KNOTS - 1)])[:, None]
         falling[:, :, 1] = constant[:, :, 1]  # the curvature bounds θ̇ as V falls
         roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, scene, np.inf, stops, braking)
-        costs[braking >= TOUCH] = np.inf
+        costs[braking >= TOUCH_COST] = np.inf
         if len(scene.movers):
-            off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, RESERVE]))
+            off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, UNMAPPED_MARGIN]))
             # The twists of a roll-out do not depend on the scene: `stops` stays as it is.
             roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, off, np.inf, stops, wide)
-            costs[wide >= TOUCH] += TOUCH
+            costs[wide >= TOUCH_COST] += TOUCH_COST
         best = int(costs.argmin())
         hard = np.where(grid[:, 0, 0] == speeds[0], braking, np.inf)
         chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(hard.argmin())]

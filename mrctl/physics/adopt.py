@@ -26,7 +26,8 @@ from mrctl.record import InputError
 from mrctl.theory.kinematics import UP
 from mrctl.theory.robot import RobotFile
 
-LEVEL = 0.1  # share of the wheel radius: a caster this near to the floor touches it, and two this close are one
+# share of the wheel radius: a caster this near to the floor touches it, and two this close are one
+FLOOR_TOLERANCE = 0.1
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 DCMOTOR = '<dcmotor joint="{}" gear="N" motorconst="k k" resistance="R" armature="J" ctrlrange="-U U"/>'
 
@@ -172,14 +173,14 @@ class _Adoption:
         low = [
             g for g in range(self.model.ngeom)
             if self.chassis in (line := self._ancestry(self.model.geom_bodyid[g])) and not wheels & set(line)
-            and self._bottom(g) - floor < LEVEL * self.radius
+            and self._bottom(g) - floor < FLOOR_TOLERANCE * self.radius
         ]  # fmt: skip
         casters: list[Wheel] = []
         colliding = [g for g in low if self.model.geom_contype[g] or self.model.geom_conaffinity[g]]
         for g in colliding or low:
             body = self.model.body(self.model.geom_bodyid[g])
             centre = self.data.geom_xpos[g]
-            if all(np.hypot(*(centre - other.centre)[:2]) > LEVEL * self.radius for other in casters):
+            if all(np.hypot(*(centre - other.centre)[:2]) > FLOOR_TOLERANCE * self.radius for other in casters):
                 caster, radius = self._contact(g, body.name, self._roller(body.name)), centre[2] - floor
                 if radius <= 0:
                     depth = floor - self._bottom(g)
@@ -207,7 +208,7 @@ class _Adoption:
         for name in self._hinges() if caster.joint in self._hinges() else ():
             carried = self._lineage(name)[0] in self._ancestry(self.model.body(caster.body).id)
             trail = np.hypot(*(caster.centre - self.data.joint(name).xanchor)[:2])
-            if carried and abs(self._axis(name)[2]) > 0.9 and trail < LEVEL * caster.radius:
+            if carried and abs(self._axis(name)[2]) > 0.9 and trail < FLOOR_TOLERANCE * caster.radius:
                 raise InputError(
                     f"steering: the joint {name!r} has no actuator, and its wheel no trail, which a caster needs; "
                     f'if it is steered, add <position joint="{name}" kp="K" kv="D"/>'

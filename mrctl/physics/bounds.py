@@ -17,29 +17,29 @@ from typing import NoReturn
 from typing_extensions import override
 
 from mrctl.record import InputError, read_file
-from mrctl.theory.grid import MOST_CELLS, check_size
+from mrctl.theory.grid import MAX_CELLS, check_size
 
-LARGEST = 64 * 2**20  # bytes of a mesh or an image
-LARGEST_TEXT = 16 * 2**20  # bytes of an MJCF file, which may contain the vertices of meshes
-MOST_WRITTEN = 20_000  # elements of a file; MuJoCo compiles so many geoms in 2 s, and 50,000 in more than 15 s
-MOST = 10_000  # elements that are made beside those written, by a count or by <attach>; 7 s
-DEEPEST = 400  # elements within each other; MuJoCo stops at 500, and Python's stack at some more
-LONGEST_CHAIN = 10  # files of which each attaches the next
-MOST_RAYS = 1e6  # of all rangefinders that look through cameras
+MAX_ASSET_BYTES = 64 * 2**20  # bytes of a mesh or an image
+MAX_MJCF_BYTES = 16 * 2**20  # bytes of an MJCF file, which may contain the vertices of meshes
+MAX_WRITTEN_ELEMENTS = 20_000  # elements of a file; MuJoCo compiles so many geoms in 2 s, and 50,000 in more than 15 s
+MAX_GENERATED_ELEMENTS = 10_000  # elements that are made beside those written, by a count or by <attach>; 7 s
+MAX_DEPTH = 400  # elements within each other; MuJoCo stops at 500, and Python's stack at some more
+MAX_ATTACH_CHAIN = 10  # files of which each attaches the next
+MAX_RAYS = 1e6  # of all rangefinders that look through cameras
 
-PRODUCTS: dict[str, list[tuple[tuple[str, ...], str, float]]] = {
-    "camera": [(("resolution",), "pixels", MOST_CELLS)],
+MAX_PRODUCTS: dict[str, list[tuple[tuple[str, ...], str, float]]] = {
+    "camera": [(("resolution",), "pixels", MAX_CELLS)],
     "composite": [(("count",), "bodies", 250)],  # nested ones; 1,000 take more than 12 s
     "flex": [(("cellcount",), "cells", 1e3)],
     "flexcomp": [(("count",), "nodes", 3e3), (("cellcount",), "cells", 1e3)],  # 2 s
-    "global": [(("offwidth", "offheight"), "pixels", MOST_CELLS)],
-    "hfield": [(("nrow", "ncol"), "cells", MOST_CELLS)],
+    "global": [(("offwidth", "offheight"), "pixels", MAX_CELLS)],
+    "hfield": [(("nrow", "ncol"), "cells", MAX_CELLS)],
     "numeric": [(("size",), "values", 500)],  # MuJoCo writes further ones beyond the end of its stack
-    "texture": [(("width", "height"), "pixels", MOST_CELLS)],
+    "texture": [(("width", "height"), "pixels", MAX_CELLS)],
 }
 """Attributes of an element whose product is the number of something, and the most of it."""
 
-HIGHEST: dict[str, float] = {
+MAX_ATTRIBUTES: dict[str, float] = {
     "memory": 2**30, "nstack": 1e8, "njmax": 1e5, "nconmax": 1e5, "nuserdata": 1e6, "nkey": 1e3,
     **{f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")},
     "num": 1e4, "dim": 1e4, "nsample": 1e5, "subgrid": 20,
@@ -47,9 +47,9 @@ HIGHEST: dict[str, float] = {
 }  # fmt: skip
 """Largest values of the attributes that alone, in any element, determine what MuJoCo allocates."""
 
-MOST_VERTICES = 22_500  # of a built-in mesh, such as a supersphere of 150 by 150; 1 s
-MOST_EDGES = 1_000  # of a built-in cone, for whose hull the time grows with their square
-MOST_STEPS = 1e4  # of the simulation that finds the length range of an actuator; by default 1,000
+MAX_VERTICES = 22_500  # of a built-in mesh, such as a supersphere of 150 by 150; 1 s
+MAX_EDGES = 1_000  # of a built-in cone, for whose hull the time grows with their square
+MAX_LENGTHRANGE_STEPS = 1e4  # of the simulation that finds the length range of an actuator; by default 1,000
 LENGTHRANGE = {"inttotal": 10.0, "timestep": 0.01}  # what these attributes are by default, in s
 SUFFIXES = {suffix: 1024.0**power for power, suffix in enumerate("KMGTPE", start=1)}  # of the attribute `memory`
 
@@ -100,8 +100,8 @@ class _Tree(ElementTree.TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
         """Opens an element; a namespace is left out of its name, since MuJoCo knows none."""
         self.written += 1
-        if self.written > MOST_WRITTEN:
-            raise InputError(f"{self.path}: more than {MOST_WRITTEN:,} elements")
+        if self.written > MAX_WRITTEN_ELEMENTS:
+            raise InputError(f"{self.path}: more than {MAX_WRITTEN_ELEMENTS:,} elements")
         return super().start(tag.rpartition("}")[2], attrs)
 
 
@@ -120,8 +120,8 @@ class _File:
             within: The files that attach this one, from the outermost to the innermost.
             known: The totals of the files that have been counted.
         """
-        if path.resolve() in within or len(within) > LONGEST_CHAIN:
-            raise InputError(f"{path}: attaches itself, or <model> is nested more than {LONGEST_CHAIN} deep")
+        if path.resolve() in within or len(within) > MAX_ATTACH_CHAIN:
+            raise InputError(f"{path}: attaches itself, or <model> is nested more than {MAX_ATTACH_CHAIN} deep")
         self.path, self.total, self.written = path, 0.0, 0
         self.folders = {path.parent}
         self.included: dict[ElementTree.Element, Path] = {}
@@ -145,12 +145,12 @@ class _File:
         self._count(root, path, 1)
         looks = sum("camera" in element.attrib for element in root.iter("rangefinder"))
         rays = max((_amount(element, path, "resolution") for element in root.iter("camera")), default=0.0) * looks
-        if rays > MOST_RAYS:
-            raise InputError(f"{path}: <rangefinder> asks for {rays:,.0f} rays; at most {MOST_RAYS:,.0f}")
+        if rays > MAX_RAYS:
+            raise InputError(f"{path}: <rangefinder> asks for {rays:,.0f} rays; at most {MAX_RAYS:,.0f}")
 
     def _parsed(self, path: Path) -> ElementTree.Element:
         """Returns the root of a file; like MuJoCo it takes all text as UTF-8 and passes over bytes that are not."""
-        text = read_file(path, LARGEST_TEXT).decode("utf-8-sig", errors="replace")
+        text = read_file(path, MAX_MJCF_BYTES).decode("utf-8-sig", errors="replace")
         tree = _Tree(path, self.written)
         parser = ElementTree.XMLParser(target=tree)
         try:
@@ -193,8 +193,8 @@ class _File:
             InputError: There are too many, or an attribute asks for too much.
         """
         file, tag = self.included.get(element, file), element.tag
-        if depth > DEEPEST:
-            raise InputError(f"{file}: <{tag}> is nested more than {DEEPEST} deep")
+        if depth > MAX_DEPTH:
+            raise InputError(f"{file}: <{tag}> is nested more than {MAX_DEPTH} deep")
         for what, asked, most in _requests(element, file):
             if asked > most:
                 raise InputError(f"{file}: <{tag}> asks for {asked:,.0f} {what}; at most {most:,.0f}")
@@ -206,8 +206,10 @@ class _File:
         if tag == "replicate":
             copies = max(0.0, _amount(element, file, "count") - 1) * (written - 1 + made)
             made, self.total = made + copies, self.total + copies
-        if made > MOST:
-            raise InputError(f"{file}: <{tag}> makes {written + made:,.0f} elements; at most {MOST:,}")
+        if made > MAX_GENERATED_ELEMENTS:
+            raise InputError(
+                f"{file}: <{tag}> makes {written + made:,.0f} elements; at most {MAX_GENERATED_ELEMENTS:,}"
+            )
         if tag in ("body", "frame") and "name" in element.attrib:
             self.named[element.attrib["name"]] = written + made
         return written, made
@@ -231,25 +233,25 @@ class _File:
 def _requests(element: ElementTree.Element, file: Path) -> Iterator[tuple[str, float, float]]:
     """Yields what the attributes of an element ask for: what it is, how many, and the most."""
     tag, given = element.tag, element.attrib
-    for attributes, what, most in PRODUCTS.get(tag, ()):
+    for attributes, what, most in MAX_PRODUCTS.get(tag, ()):
         yield what, math.prod(_amount(element, file, name) for name in attributes), most
-    for name in sorted(given.keys() & HIGHEST.keys()):
-        yield f"as {name}", _amount(element, file, name), HIGHEST[name]
+    for name in sorted(given.keys() & MAX_ATTRIBUTES.keys()):
+        yield f"as {name}", _amount(element, file, name), MAX_ATTRIBUTES[name]
     if tag == "texture" and given.get("type") != "2d" and "builtin" in given:  # six of them; the height is ignored
-        yield "pixels of a face", _amount(element, file, "width") ** 2, MOST_CELLS / 4
+        yield "pixels of a face", _amount(element, file, "width") ** 2, MAX_CELLS / 4
     elif tag == "numeric":
         yield "values", len(given.get("data", "").split()), 500
     elif tag == "lengthrange":
         duration, step = (_amount(element, file, name, default) for name, default in LENGTHRANGE.items())
-        yield "steps", duration / step if step else math.inf, MOST_STEPS
+        yield "steps", duration / step if step else math.inf, MAX_LENGTHRANGE_STEPS
     elif tag == "mesh" and "params" in given:
         kind, first = given.get("builtin"), _number(given["params"].split()[:1], file, "mesh> params")
         if kind == "cone":
-            yield "edges", first, MOST_EDGES
+            yield "edges", first, MAX_EDGES
         elif kind in ("wedge", "plate"):
-            yield "vertices", _number(given["params"].split()[:2], file, "mesh> params"), MOST_VERTICES
+            yield "vertices", _number(given["params"].split()[:2], file, "mesh> params"), MAX_VERTICES
         elif kind in ("supersphere", "supertorus"):
-            yield "vertices", first**2, MOST_VERTICES
+            yield "vertices", first**2, MAX_VERTICES
     elif tag == "config" and given.get("key") in ("size", "nchannel"):  # of the plugin `touch_grid`
         yield str(given["key"]), _amount(element, file, "value"), 1e5
 
@@ -286,7 +288,7 @@ def _exists(file: Path) -> bool:
 
 def _check_asset(file: Path) -> None:
     """Refuses a mesh or image that is not a regular file, is too large, or is a PNG of too many pixels."""
-    head = read_file(file, LARGEST)[:24]
+    head = read_file(file, MAX_ASSET_BYTES)[:24]
     if head.startswith(b"\x89PNG") and len(head) == 24:
         width, height = struct.unpack(">II", head[16:])
         check_size(height, width, str(file))

@@ -51,7 +51,7 @@ def contacts(model: mujoco.MjModel, data: mujoco.MjData) -> Contacts:
         velocity = motion @ data.qvel
         slip = velocity - frame[0] * (frame[0] @ velocity)
         found.append((contact.pos.copy(), force if own[1] else -force, slip))
-    return Contacts(*(np.array(part).reshape(-1, 3) for part in zip(*found, strict=True))) if found else NOTHING
+    return Contacts(*(np.array(part).reshape(-1, 3) for part in zip(*found, strict=True))) if found else NO_CONTACTS
 
 
-NOTHING = Contacts(*(np.zeros((0, 3)) for _ in range(3)))
+NO_CONTACTS = Contacts(*(np.zeros((0, 3)) for _ in range(3)))

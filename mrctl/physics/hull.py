@@ -13,9 +13,9 @@ from mrctl.physics.elements import REAR, bodies_of, fronts, has
 from mrctl.physics.stand import steer
 from mrctl.record import InputError
 
-ANGLES = np.arange(32) * (2 * np.pi / 32)  # rad, in which supports are taken; a disc loses half a per cent
-LEVEL = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(len(ANGLES))])  # these directions
-CORNERS = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T  # of a box, in half of its sides
+SUPPORT_ANGLES = np.arange(32) * (2 * np.pi / 32)  # rad, in which supports are taken; a disc loses half a per cent
+SUPPORT_DIRECTIONS = np.column_stack([np.cos(SUPPORT_ANGLES), np.sin(SUPPORT_ANGLES), 0 * SUPPORT_ANGLES])
+BOX_CORNERS = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T  # of a box, in half of its sides
 
 
 def footprint(model: mujoco.MjModel) -> Array:
@@ -66,12 +66,12 @@ def _extremes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:
     """
     kind, size, shape = model.geom_type[geom], model.geom_size[geom], mujoco.mjtGeom
     frame, centre = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-    ahead = (LEVEL @ frame).round(12)  # the directions in the frame of the geom
+    ahead = (SUPPORT_DIRECTIONS @ frame).round(12)  # the directions in the frame of the geom
     if kind == shape.mjGEOM_MESH:
         mesh = model.mesh(model.geom_dataid[geom])
         own = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
     elif kind == shape.mjGEOM_BOX:
-        own = size * CORNERS
+        own = size * BOX_CORNERS
     elif kind == shape.mjGEOM_ELLIPSOID:
         own = size**2 * ahead / np.linalg.norm(size * ahead, axis=1, keepdims=True)
     else:  # spheres, and the two ends of capsules and cylinders

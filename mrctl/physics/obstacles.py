@@ -22,15 +22,15 @@ from mrctl.physics.bounds import check_bounds, compiling
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
-from mrctl.theory.obstacles import FLAT, OVERHEAD, Box, Disc, Obstacles, Polygon
+from mrctl.theory.obstacles import GROUND_HEIGHT, OVERHEAD_HEIGHT, Box, Disc, Obstacles, Polygon
 
 HULL = "hull"  # name of the hull's geom
-BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
-IDLE = 4  # of conaffinity; no geom has it in its contype, and one with no bit at all is left out of MuJoCo's trees
-GROUP = 2  # of walls: rays that look for the ground see only group 0
-HEIGHT = 0.5  # m, by which walls reach above and below the origin, because floors need not be level
-TALL = 0.1  # m, height of the hull above the axle
-DEEP = 10.0  # m below the origin, where idle geoms lie
+CONTACT_BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
+IDLE_BIT = 4  # of conaffinity; no geom has it in its contype, and one with no bit at all is left out of MuJoCo's trees
+WALL_GROUP = 2  # of walls: rays that look for the ground see only group 0
+WALL_HEIGHT = 0.5  # m, by which walls reach above and below the origin, because floors need not be level
+HULL_HEIGHT = 0.1  # m, height of the hull above the axle
+IDLE_DEPTH = 10.0  # m below the origin, where idle geoms lie
 
 
 def layout(obstacles: Obstacles) -> Hashable:
@@ -55,13 +55,13 @@ def add(spec: mujoco.MjSpec, obstacles: Obstacles, footprint: Array, idle: int =
     add_walls(spec, obstacles)
     for _ in range(idle):
         spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], pos=[0, 0, -DEEP], contype=0, conaffinity=IDLE,
-            group=4,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], pos=[0, 0, -IDLE_DEPTH], contype=0,
+            conaffinity=IDLE_BIT, group=4,
         )  # fmt: skip
     chassis = spec.body("chassis")
-    _prism(spec, HULL, footprint, 0.0, TALL)
+    _prism(spec, HULL, footprint, 0.0, HULL_HEIGHT)
     chassis.add_geom(
-        name=HULL, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=HULL, mass=0, contype=BIT, conaffinity=0, group=4,
+        name=HULL, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=HULL, mass=0, contype=CONTACT_BIT, conaffinity=0, group=4,
         rgba=[0.2, 0.5, 1, 0.3],
     )  # fmt: skip
     spec.add_sensor(
@@ -78,16 +78,25 @@ def add_walls(spec: mujoco.MjSpec, obstacles: Obstacles) -> None:
             x, y, theta = shape.course.sample(np.zeros(1)).pose[0]
             body = body.add_body(name=name, mocap=True, pos=[x, y, 0], quat=quaternion(theta))
             spec.add_text(name=name, data=json.dumps(shape.course.model_dump(mode="json")))
-        common = {"name": name, "contype": 0, "conaffinity": BIT, "group": GROUP, "rgba": [0.45, 0.43, 0.41, 1]}
+        common = {
+            "name": name,
+            "contype": 0,
+            "conaffinity": CONTACT_BIT,
+            "group": WALL_GROUP,
+            "rgba": [0.45, 0.43, 0.41, 1],
+        }
         if isinstance(shape, Disc):
             body.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[shape.radius, HEIGHT, 0], pos=[shape.x, shape.y, 0], **common
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+                size=[shape.radius, WALL_HEIGHT, 0],
+                pos=[shape.x, shape.y, 0],
+                **common,
             )
         elif isinstance(shape, Box):
-            size, place = [shape.length / 2, shape.width / 2, HEIGHT], [shape.x, shape.y, 0]
+            size, place = [shape.length / 2, shape.width / 2, WALL_HEIGHT], [shape.x, shape.y, 0]
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=place, quat=quaternion(shape.angle), **common)
         else:
-            _prism(spec, name, shape.vertices, -HEIGHT, HEIGHT)
+            _prism(spec, name, shape.vertices, -WALL_HEIGHT, WALL_HEIGHT)
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **common)
 
 
@@ -191,7 +200,7 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
         half = size[[0, 0, 1]] if kind == shape.mjGEOM_CYLINDER else size
         points = place + np.abs(frame[2]) @ half * np.array([[0, 0, -1.0], [0, 0, 1]])
     low, high = points[:, 2].min(), points[:, 2].max()
-    if high <= FLAT:
+    if high <= GROUND_HEIGHT:
         return None
     name = model.geom(geom).name or f"number {geom}"
     body = model.geom_bodyid[geom]
@@ -205,7 +214,7 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
     upright = abs(frame[2, 2]) >= 1 - 1e-9 and (kind == shape.mjGEOM_BOX or kind == shape.mjGEOM_CYLINDER)
     if mesh is None and not upright:
         raise InputError(f"geom {name}: not an upright box or cylinder, nor a mesh")
-    if low >= OVERHEAD:
+    if low >= OVERHEAD_HEIGHT:
         return None
     if mesh is not None:
         return {"kind": "polygon", "points": convex(points[:, :2].round(6)).tolist()}

@@ -14,7 +14,7 @@ from mrctl.kernel import Array
 
 REFERENCE_COLOUR = 110, 115, 122
 """Colour of the reference in every view, as red, green and blue."""
-SHADOW = 1024
+SHADOW_PIXELS = 1024
 """Number of pixels along each side of the shadow map; a larger one takes most of the time without a GPU."""
 
 

@@ -32,10 +32,10 @@ from mrctl.physics.readout import READING, addresses, current_limits, imu_motion
 from mrctl.physics.stand import stand
 from mrctl.theory.drive import DRIVER, SERVO, Driver, SteeringServo, chop, drive, turn
 from mrctl.theory.obstacles import Obstacles, Surroundings
-from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
+from mrctl.theory.perturbation import MAX_DELAY, Perturbation
 from mrctl.theory.robot import Robot
 
-TILT = float(np.cos(np.radians(30)))  # least cosine of the tilt; a robot that tilts further has failed
+MIN_COS_TILT = float(np.cos(np.radians(30)))  # least cosine of the tilt; a robot that tilts further has failed
 IDEAL_DRIVER, IDEAL_SERVO = Driver(), SteeringServo()
 
 PLANT = np.dtype(
@@ -133,7 +133,7 @@ def look(first: int, last: int, period: float, place: int) -> bool:
                 p.current[k] = max(-limit, min(limit, act[i, acts[k]]))
             else:
                 p.current[k] = (p.applied[k] - p.emf[k]) / p.resistance[k]
-        upright &= p.reading.upright > TILT or p.failed
+        upright &= p.reading.upright > MIN_COS_TILT or p.failed
     return upright
 
 
@@ -204,7 +204,7 @@ class Plant(ABC):
         state["driver"]["supply"], state["driver"]["gain"], state["driver"]["scale"] = robot.supply, 1.0, 1.0
         state["driver"]["current_limit"] = current_limits(model)
         # Long enough for the largest possible delays of sensing and perturbation, because those may change.
-        self._queue = np.zeros((1 + round(2 * LONGEST_DELAY / self._period), size, 4))
+        self._queue = np.zeros((1 + round(2 * MAX_DELAY / self._period), size, 4))
         self._tick = 0
         self._pushes: dict[int, int] = {}
         self._chassis = model.body("chassis").id
@@ -390,7 +390,7 @@ class Plant(ABC):
                 del self._pushes[robot]
         if not self._look(0, self.size, self._period, self._held.place):
             upright = self.reading["upright"]
-            for robot in np.flatnonzero(~(upright > TILT)):
+            for robot in np.flatnonzero(~(upright > MIN_COS_TILT)):
                 self.fail(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
 
     def fail(self, robot: int, reason: str) -> None:

@@ -13,7 +13,7 @@ from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.physics.elements import MOTORS, has
 
 JOINTS = ("chassis", "wheel_left", "wheel_right")
-HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a valid state
+MAX_VALUE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a valid state
 
 READING = np.dtype(
     [
@@ -57,10 +57,10 @@ def read(qpos: Array, qvel: Array, address: NDArray[np.int64], r: Row) -> None:
     r.upright = 1 - 2 * (i * i + j * j)
     r.z, r.roll, r.pitch = qpos[q + 2], np.arctan2(yz, r.upright), np.arctan2(-xz, np.hypot(xx, xy))
     for value in qpos:
-        if not abs(value) < HUGE:
+        if not abs(value) < MAX_VALUE:
             r.upright = np.nan
     for value in qvel:
-        if not abs(value) < HUGE:
+        if not abs(value) < MAX_VALUE:
             r.upright = np.nan
 
 

@@ -22,10 +22,11 @@ from mrctl.physics.readout import inputs
 from mrctl.physics.stand import stand
 from mrctl.theory.robot import Tyres
 
-PUSH = 1.0  # m/s², specific force to the left while the load of the wheels is measured
-REST = 0.5  # s, duration of the push, after which nothing moves any more
-START, GAIN = 0.3, 0.2  # initial speed of the measured acceleration and gain of speed, as shares of the largest speed
-RAMP = 1.0  # s, duration of the acceleration; the first third, in which the motors settle, is left out
+PUSH_ACCELERATION = 1.0  # m/s², specific force to the left while the load of the wheels is measured
+PUSH_TIME = 0.5  # s, duration of the push, after which nothing moves any more
+# initial speed of the measured acceleration and gain of speed, as shares of the largest speed
+START_SPEED, SPEED_GAIN = 0.3, 0.2
+RAMP_TIME = 1.0  # s, duration of the acceleration; the first third, in which the motors settle, is left out
 _known: dict[bytes, Tyres] = {}  # measured tyres by the hash of the model
 
 
@@ -60,21 +61,21 @@ def _measured(model: mujoco.MjModel) -> Tyres:
         return data
 
     data = begin(0.0)
-    model.opt.gravity[1] = -PUSH
-    for _ in range(round(REST / step)):
+    model.opt.gravity[1] = -PUSH_ACCELERATION
+    for _ in range(round(PUSH_TIME / step)):
         mujoco.mj_step(model, data)
     model.opt.gravity[1] = 0.0
     wheels = [model.geom(wheel).id for wheel in REAR]
     left, right = (data.contact.dist[(data.contact.geom == wheel).any(axis=1)].min(initial=0.0) for wheel in wheels)
     # A tyre that has sunk in by d rolls on the radius r − d/2, because the contact is in the middle of the overlap.
-    load = (left - right) / 4 / robot.wheel_radius / PUSH
+    load = (left - right) / 4 / robot.wheel_radius / PUSH_ACCELERATION
 
-    data, motors = begin(START * robot.max_speed), inputs(model)[:2]
+    data, motors = begin(START_SPEED * robot.max_speed), inputs(model)[:2]
     angles = [model.joint(wheel).qposadr[0] for wheel in REAR]
-    count = round(RAMP / step)
+    count = round(RAMP_TIME / step)
     rows = np.empty((count, 3))
     for k in range(count):
-        data.ctrl[motors] = (START + GAIN * k / count) * robot.max_speed / robot.velocity_gain
+        data.ctrl[motors] = (START_SPEED + SPEED_GAIN * k / count) * robot.max_speed / robot.velocity_gain
         mujoco.mj_step(model, data)
         rows[k] = data.qpos[0], data.qvel[0], robot.wheel_radius * data.qpos[angles].mean()
     way, speed, rolled = rows[count // 3 :].T

@@ -24,9 +24,9 @@ from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, LIMITS, Robot
 
 RPM = 30 / math.pi  # rpm of 1 rad/s
-GYRATION = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
-LONGEST = 20.0  # largest length of a part over the track of a robot
-LENGTHS = (
+GYRATION_RATIOS = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
+MAX_LENGTH_RATIO = 20.0  # largest length of a part over the track of a robot
+LENGTH_ATTRIBUTES = (
     "com_offset", "com_height", "wheel_radius", "front_wheel_radius", "half_track", "wheelbase", "trail",
 )  # fmt: skip
 
@@ -113,7 +113,7 @@ def bounds(robot: Robot) -> list[Bound]:
 def extent(model: mujoco.MjModel, robot: Robot) -> Bound:
     """Returns the bound on the longest part beside the wheels, whose length is no parameter of equations (1) to (3)."""
     name, length = _longest(model)
-    return Bound(f"length of {name} over the track", length / (2 * robot.half_track), 0, LONGEST, "")
+    return Bound(f"length of {name} over the track", length / (2 * robot.half_track), 0, MAX_LENGTH_RATIO, "")
 
 
 def too_long(model: mujoco.MjModel, half_track: float) -> str:
@@ -124,7 +124,7 @@ def too_long(model: mujoco.MjModel, half_track: float) -> str:
         half_track: Half of its track in m. The wheelbase does not count, as such a part may be taken for a caster.
     """
     (name, length), track = _longest(model), 2 * half_track
-    if not length > LONGEST * track > 0:
+    if not length > MAX_LENGTH_RATIO * track > 0:
         return ""
     unit = min(("mm", 1e3), ("cm", 1e2), key=lambda unit: abs(math.log(length / unit[1] / track)))[0]
     return f"{name} is {length:,.4g} m long, which no part of such a robot is; is it in {unit}? It must be in m"
@@ -242,13 +242,13 @@ def _of_mass(robot: Robot, mass: float, factor: float) -> dict[str, float]:
 
 def _of_lengths(robot: Robot, factor: float) -> dict[str, float]:
     """Returns all lengths times a factor, and the inertias times its square where they were in the wrong unit too."""
-    return _scaled(robot, LENGTHS, factor) | _inertias(robot, robot.mass, factor, factor**2)
+    return _scaled(robot, LENGTH_ATTRIBUTES, factor) | _inertias(robot, robot.mass, factor, factor**2)
 
 
 def _inertias(robot: Robot, mass: float, length: float, factor: float) -> dict[str, float]:
     """Returns wheel inertias times a factor and a typical yaw inertia, if the radius of gyration is out of bounds."""
     size = length * robot.size
-    if GYRATION[0] <= math.sqrt(robot.yaw_inertia / mass) / size <= GYRATION[1]:
+    if GYRATION_RATIOS[0] <= math.sqrt(robot.yaw_inertia / mass) / size <= GYRATION_RATIOS[1]:
         return {}
     of_wheels = _scaled(robot, ("wheel_inertia", "front_wheel_inertia", "fork_inertia"), factor)
     of_wheels["wheel_inertia"] = max(1e-9, of_wheels["wheel_inertia"])

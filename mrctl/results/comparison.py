@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from mrctl.kernel import Array
 from mrctl.record import InputError
 
-FEW = 10  # samples; with fewer the bootstrap of a mean is too narrow: its 95 % interval of four holds it in 80 %
+# samples; with fewer the bootstrap of a mean is too narrow: its 95 % interval of four holds it in 80 %
+MIN_BOOTSTRAP = 10
 
 
 class Interval(NamedTuple):
@@ -78,7 +79,7 @@ def bootstrap_interval(
     finite = values[np.isfinite(values)]
     statistic = np.median if median else np.mean
     value = float(statistic(finite)) if len(finite) else np.nan
-    if median or len(finite) >= FEW:
+    if median or len(finite) >= MIN_BOOTSTRAP:
         low, high = _interval((finite,), statistic, level, n, seed)
     else:
         low, high = _student(finite, level)

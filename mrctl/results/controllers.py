@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import cycle
 
-CONTROLLER = ("prior", "learner")
+CONTROLLER_FIELDS = ("prior", "learner")
 """Fields of a scenario that choose its controller."""
 
 # Display name and colour, by the name in tables. The first six have colours of Okabe and Ito (2008).
@@ -26,7 +26,7 @@ CONTROLLERS: dict[str, tuple[str, str]] = {
     "mrac": ("PID + MRAC", "#5B21B6"),
 }
 
-LIGHTER = (0.0, 0.45, -0.4, 0.7, -0.65, 0.25, -0.2)
+SHADES = (0.0, 0.45, -0.4, 0.7, -0.65, 0.25, -0.2)
 """Shares by which the curves or robots of one controller differ from its colour."""
 
 
@@ -49,7 +49,7 @@ def colours_of(controllers: Iterable[str]) -> list[str]:
     own = {name: CONTROLLERS[name][1] if name in CONTROLLERS else next(free) for name in names}
     before, found = dict.fromkeys(names, 0), []
     for name in controllers:
-        found.append(_shaded(own[name], LIGHTER[before[name] % len(LIGHTER)]))
+        found.append(_shaded(own[name], SHADES[before[name] % len(SHADES)]))
         before[name] += 1
     return found
 

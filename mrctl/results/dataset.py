@@ -23,8 +23,8 @@ from mrctl.kernel import Array
 from mrctl.record import InputError, printable, read_file, reading
 from mrctl.scenario import Scenario
 
-SMALL = 2**30  # bytes of signals that any result may have
-EXPANSION = 1000  # bytes of signals that a larger result may have for each byte in its files
+MAX_SMALL_BYTES = 2**30  # bytes of signals that any result may have
+MAX_EXPANSION = 1000  # bytes of signals that a larger result may have for each byte in its files
 
 # Name: (unit, meaning). A sample at time t holds the state at t, the commands computed from it, and the currents and
 # power at the end of the control period that begins at t; the commands act after the delay.
@@ -100,7 +100,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
 
 # Variables with the gains of each run at its start, before any event: name: (unit, meaning). `k_p` and `k_i` have the
 # dimensions run and channel, common and second; a steering channel (`rigid`) has K_p without unit and K_i in 1/s.
-GAINS: dict[str, tuple[str, str]] = {
+GAIN_VARIABLES: dict[str, tuple[str, str]] = {
     "k_p": ("V/(m/s), V/(rad/s)", "K_p of the PID for the common and the second channel; 1 on a steering channel"),
     "k_i": ("V/m, V/rad", "K_i of the PID for the common and the second channel; 1/s on a steering channel"),
     "k_x": ("1/s", "K_x of the motion controller"),
@@ -117,11 +117,11 @@ FAULTS = {
 }
 
 # Attribute of a saved result: its variables, each of whose files holds all chunks, even with only NaN.
-WHOLE = "variables"
-WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
+COMPLETE = "variables"
+COMPLETE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
 CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
-ADDED = (  # signals that results of older versions lack
+ADDED_SIGNALS = (  # signals that results of older versions lack
     "z", "roll_angle", "pitch_angle", "retunes", "feedforward_limited", "motor_voltage_left", "motor_voltage_right",
 )  # fmt: skip
 
@@ -156,7 +156,7 @@ def written_by(result: xr.Dataset) -> str:
     return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
 
 
-NEEDED = {"scenarios", "versions", "control_period"}
+NEEDED_ATTRIBUTES = {"scenarios", "versions", "control_period"}
 """Attributes of a result that can be saved."""
 
 
@@ -269,7 +269,7 @@ def save(result: xr.Dataset, path: str | Path) -> None:
             written, or is that of a file in another format.
     """
     check_kind(result)
-    if missing := NEEDED - set(result.attrs):
+    if missing := NEEDED_ATTRIBUTES - set(result.attrs):
         raise InputError(
             f"result: lacks the attribute {min(missing)}, without which mrctl could not open it; result.to_zarr(path) "
             "writes any dataset"
@@ -285,7 +285,7 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         checked = {str(name): {"compressors": (ZstdCodec(), Crc32cCodec())} for name in result.variables}
-        result = result.assign_attrs({WHOLE: sorted(map(str, result.variables))})
+        result = result.assign_attrs({COMPLETE: sorted(map(str, result.variables))})
         result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False, encoding=checked, write_empty_chunks=True)
         _seal(partial)
         partial.rename(path)
@@ -358,7 +358,7 @@ def check_declared(path: Path, declared: int, stored: int) -> None:
     Raises:
         InputError: The data would take too much memory.
     """
-    if declared > max(SMALL, EXPANSION * stored):
+    if declared > max(MAX_SMALL_BYTES, MAX_EXPANSION * stored):
         raise InputError(f"{path}: declares {declared / 1e9:,.0f} GB of data and holds {stored / 1e6:,.3g} MB")
 
 
@@ -467,17 +467,17 @@ def open_result(path: str | Path) -> xr.Dataset:
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
         if CHECKSUMS in result.attrs:
             _check_sums(Path(path), dict(result.attrs.pop(CHECKSUMS)))
-    if gone := set(result.attrs.get(WHOLE, ())) - set(result.variables):
+    if gone := set(result.attrs.get(COMPLETE, ())) - set(result.variables):
         raise InputError(f"{Path(path) / min(gone)}: missing")
     for folder, array in arrays.items():
-        whole = {WHOLE, WHOLE_BEFORE_0_10_2} & set(result.attrs)
+        whole = {COMPLETE, COMPLETE_BEFORE_0_10_2} & set(result.attrs)
         if whole and (lost := array.nchunks - array.nchunks_initialized):
             raise InputError(f"{folder}: {lost} chunks are missing")
     for name in result.variables:
         with reading_chunks(f"{path}/{name}"):
             result.variables[name].load()  # alone, without its coordinates
-    for name in (WHOLE, WHOLE_BEFORE_0_10_2):
+    for name in (COMPLETE, COMPLETE_BEFORE_0_10_2):
         result.attrs.pop(name, None)
-    if missing := NEEDED - set(result.attrs):
+    if missing := NEEDED_ATTRIBUTES - set(result.attrs):
         raise InputError(f"{path}: not a saved result: no {min(missing)}")
     return result

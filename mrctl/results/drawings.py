@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 
-from mrctl.results.plots import COLOURS, COLUMN, PAGE, styled
+from mrctl.results.plots import COLOURS, COLUMN_WIDTH, PAGE_WIDTH, styled
 
 Point = Sequence[float] | np.ndarray
 
@@ -36,7 +36,7 @@ def _arrow(axes: Axes, start: Point, end: Point, style: str = "-|>", **options: 
 @styled
 def posture_definition() -> Figure:
     """Draws the definition of the car-like robot's posture in the world frame (the paper's figure 2)."""
-    figure, axes = _canvas(COLUMN, 0.82 * COLUMN, (-0.75, 6.35, -0.7, 5.122))
+    figure, axes = _canvas(COLUMN_WIDTH, 0.82 * COLUMN_WIDTH, (-0.75, 6.35, -0.7, 5.122))
     theta, phi, wheelbase, half_track = np.deg2rad(28), np.deg2rad(30), 2.4, 0.8
     p = np.array([1.9, 1.75])
 
@@ -112,7 +112,7 @@ def posture_definition() -> Figure:
 @styled
 def control_structure() -> Figure:
     """Draws the two-level hierarchy of motion and velocity control (the paper's figure 3)."""
-    figure, axes = _canvas(PAGE, PAGE * 82 / 180, (0, 180, 2, 84))  # data in mm
+    figure, axes = _canvas(PAGE_WIDTH, PAGE_WIDTH * 82 / 180, (0, 180, 2, 84))  # data in mm
     middle, top = 40, 66
 
     def rounded(x: float, y: float, width: float, height: float, radius: float, **options: object) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from mrctl.control.features import NAMES, feature_matrix
+from mrctl.control.features import FEATURE_NAMES, feature_matrix
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import require
@@ -129,7 +129,7 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
             "time": runs["time"].values,
             "run": runs["run"].values,
             "label": ("run", [str(label) for label in runs["label"].values]),
-            "feature": list(NAMES),
+            "feature": list(FEATURE_NAMES),
         },
     )
 
@@ -155,4 +155,4 @@ def parameter_error(result: xr.Dataset) -> xr.DataArray:
     runs = as_runs(result)
     error = (runs["parameters"] - runs["true_parameters"]).transpose("run", "feature", "channel")
     attrs = {"units": "V", "long_name": "error of the parameters at the end"}
-    return error.assign_coords(feature=list(NAMES), channel=["common", "differential"]).assign_attrs(attrs)
+    return error.assign_coords(feature=list(FEATURE_NAMES), channel=["common", "differential"]).assign_attrs(attrs)

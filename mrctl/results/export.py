@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError, reading
-from mrctl.results.dataset import ADDED, FAULTS, SIGNALS, require, scenarios_of
+from mrctl.results.dataset import ADDED_SIGNALS, FAULTS, SIGNALS, require, scenarios_of
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import GRAVITY
 
@@ -230,7 +230,7 @@ def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, path: P
         from mcap_ros2.writer import Writer
     except ImportError:
         raise InputError("to: mcap needs a library, pip install 'mrctl[mcap]'") from None
-    require(whole, [name for name in SIGNALS if name not in ADDED])  # no message needs these
+    require(whole, [name for name in SIGNALS if name not in ADDED_SIGNALS])  # no message needs these
     if scenario is None and "scenarios" not in whole.attrs:
         raise InputError("result: does not hold its scenarios; mrctl export STORE --to mcap finds those of a sweep")
     held = dict(zip(whole["run"].values.tolist(), scenarios_of(whole), strict=True)) if scenario is None else {}

@@ -34,7 +34,7 @@ from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 
-COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
+COLUMN_WIDTH, PAGE_WIDTH = 88 / 25.4, 180 / 25.4  # inches
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
 REFERENCE: dict[str, Any] = {"color": "0.25", "lw": 0.8, "ls": (0, (4, 2)), "zorder": 3}
 FORMATS = ("png", "pdf")
@@ -142,7 +142,7 @@ def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int
     Obstacles are grey; one that moves is drawn as an outline where it is at the end, with a dotted line from where it
     was at the beginning.
     """
-    figure, (axes,) = _figure(COLUMN, COLUMN * 0.95)
+    figure, (axes,) = _figure(COLUMN_WIDTH, COLUMN_WIDTH * 0.95)
     curves = _curves(result, window, lap)
     if "scenarios" in result.attrs:
         times = max((data["time"].values[np.isfinite(data["x"].values)] for data, *_ in curves), key=len)
@@ -167,7 +167,7 @@ def velocities(
     lap: int | None = None,
 ) -> Figure:
     """Draws linear velocity and yaw rate, or one of them, over time with the original reference (paper's figure 4)."""
-    figure, axes = _figure(COLUMN, (0.1 + 0.4 * len(signals)) * COLUMN, rows=len(signals))
+    figure, axes = _figure(COLUMN_WIDTH, (0.1 + 0.4 * len(signals)) * COLUMN_WIDTH, rows=len(signals))
     curves = _curves(result, window, lap)
     texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
     for one, name in zip(axes, signals, strict=True):
@@ -221,8 +221,8 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
     """Draws feedback, feedforward and total voltage of each wheel over time, in a column for each run."""
     curves = _curves(result, window, lap)
     count = len(curves)
-    width = COLUMN if count == 1 else max(PAGE, 60 / 25.4 * count)
-    figure, axes = _figure(width, 0.95 * COLUMN, rows=2, columns=count, sharey=True)
+    width = COLUMN_WIDTH if count == 1 else max(PAGE_WIDTH, 60 / 25.4 * count)
+    figure, axes = _figure(width, 0.95 * COLUMN_WIDTH, rows=2, columns=count, sharey=True)
     # The total is wide and pale, and lies under its parts.
     parts = (("voltage", "0.75", 3.0), ("feedback", COLOURS[1], 1.0), ("feedforward", COLOURS[2], 1.0))
     for column, (data, label, _) in enumerate(curves):
@@ -249,7 +249,7 @@ def feedforward_outputs(
     result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None
 ) -> Figure:
     """Draws the feedforward voltage of the left and the right motor over time (the paper's figure 6)."""
-    figure, axes = _figure(COLUMN, 0.9 * COLUMN, rows=2, sharey=True)
+    figure, axes = _figure(COLUMN_WIDTH, 0.9 * COLUMN_WIDTH, rows=2, sharey=True)
     curves = _curves(result, window, lap)
     for one, wheel in zip(axes, ("left", "right"), strict=True):
         _signals(one, curves, f"feedforward_{wheel}", rf"$U_{{ff,{wheel[0]}}}$ (V)")
@@ -275,7 +275,9 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
     laps = as_runs(result if "lap" in result.dims else per_lap(result))
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
-    figure, axes = _figure(COLUMN if columns == 1 else PAGE, 0.75 * rows * COLUMN, rows=rows, columns=columns)
+    figure, axes = _figure(
+        COLUMN_WIDTH if columns == 1 else PAGE_WIDTH, 0.75 * rows * COLUMN_WIDTH, rows=rows, columns=columns
+    )
     number = laps["lap"].values
     labels = [str(label) for label in laps["label"].values]
     for unused in axes[len(names) :]:
@@ -323,7 +325,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
         raise InputError("cases: at least one is needed")
     columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
     rows = -(-len(cases) // columns)
-    figure, axes = _figure(PAGE, (0.12 + 0.55 * rows) * COLUMN, rows=rows, columns=columns, sharey=True)
+    figure, axes = _figure(PAGE_WIDTH, (0.12 + 0.55 * rows) * COLUMN_WIDTH, rows=rows, columns=columns, sharey=True)
     order: list[str] = []
     for one, (title, laps) in zip(axes, cases.items(), strict=False):
         number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
@@ -361,7 +363,7 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
         samples: A positive number for each run, by name.
         label: Quantity and unit for the axis.
     """
-    figure, (axes,) = _figure(COLUMN, 0.8 * COLUMN)
+    figure, (axes,) = _figure(COLUMN_WIDTH, 0.8 * COLUMN_WIDTH)
     for order, values in enumerate(samples.values()):
         finite = np.sort(values[np.isfinite(values)])
         axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **_line(order))
@@ -387,7 +389,7 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         run: Index of the run whose features are drawn, one line each.
     """
     found = exciting.excitation(result, span, motion)
-    figure, axes = _figure(COLUMN, 1.2 * COLUMN, rows=2)
+    figure, axes = _figure(COLUMN_WIDTH, 1.2 * COLUMN_WIDTH, rows=2)
     curves = _curves(found, None, None)
     _signals(axes[0], curves, "least", r"$\lambda_{\min}$ (1)")
     for order, name in enumerate(found["feature"].values):
@@ -435,7 +437,7 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
     """
     if not maps:
         raise InputError("maps: at least one is needed")
-    figure, axes = _figure(PAGE, (0.1 + 0.36 * len(maps)) * PAGE, rows=len(maps), columns=6, sharey=True)
+    figure, axes = _figure(PAGE_WIDTH, (0.1 + 0.36 * len(maps)) * PAGE_WIDTH, rows=len(maps), columns=6, sharey=True)
     true = np.stack([one.true for one in maps.values()])
     for row, (name, one) in enumerate(maps.items()):
         for channel, symbol in enumerate((r"\Sigma", r"\Delta")):
@@ -612,13 +614,13 @@ def _legend(figure: Figure, curves: Sequence[Curve], title: str, reference: bool
     if reference:
         dashes = {key: value for key, value in REFERENCE.items() if key != "zorder"}
         handles, names = [Line2D([], [], **dashes), *handles], ["reference", *names]
-    columns = 2 if sum(map(len, names)) > 36 and figure.get_figwidth() < PAGE else 4
+    columns = 2 if sum(map(len, names)) > 36 and figure.get_figwidth() < PAGE_WIDTH else 4
     figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns), title=title)
 
 
 def _errors(curves: Sequence[Curve], plant: str) -> Figure:
     """Draws the three errors, each in a panel."""
-    figure, axes = _figure(COLUMN, 1.15 * COLUMN, rows=3)
+    figure, axes = _figure(COLUMN_WIDTH, 1.15 * COLUMN_WIDTH, rows=3)
     for one, (name, label) in zip(axes, ERRORS.items(), strict=True):
         one.axhline(0, color="0.6", lw=0.6)
         _signals(one, curves, name, label, MILLI)

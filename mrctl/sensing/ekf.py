@@ -2,7 +2,7 @@
 
     x = (x, y, θ, V, θ̇, b, o, λ_l, λ_r, s_l, s_r)
 
-    (ẋ, ẏ) = V (cos θ, sin θ) + v_y (−sin θ, cos θ),    v_y = −c V θ̇,  c = `SIDE`
+    (ẋ, ẏ) = V (cos θ, sin θ) + v_y (−sin θ, cos θ),    v_y = −c V θ̇,  c = `SIDE_SLIP_TIME`
     V̇ = a − o,    θ̈ = θ̈_c,    λ̇_l,r = (u_l,r − κ u̇_l,r)/(r (1 + s_l,r ± ρ a_y)),    u_l,r = V ∓ D θ̇
     b, o and s constant;    each plus noise
 
@@ -28,49 +28,50 @@ from mrctl.sensing.prediction import front, predict, wrapped
 
 N = 11  # number of states
 X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
-KEPT = 5  # largest number of states that are stored for fixes that have not arrived
+MAX_STORED = 5  # largest number of states that are stored for fixes that have not arrived
 
-# Process noise. All values but JOLT are chosen, and tests check them by the filter's error (NEES, chi-square).
-TURN = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz
-SETTLE = 1.5  # s, time in which o follows the faster offset of `find_grip`
-LOOSE_V = 0.5  # further noise of V̇ while no wheel grips, m/s²/√Hz
-INCLINE = 0.012  # random walk of the component of gravity in the accelerometer, m/s²/√s
+# Process noise. All values but JOLT_SLIP are chosen, and tests check them by the filter's error (NEES, chi-square).
+YAW_NOISE = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz
+OFFSET_SETTLING = 1.5  # s, time in which o follows the faster offset of `find_grip`
+SLIPPING_NOISE = 0.5  # further noise of V̇ while no wheel grips, m/s²/√Hz
+INCLINE_WALK = 0.012  # random walk of the component of gravity in the accelerometer, m/s²/√s
 SIDE_SLIP, SKID = 3e-5, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and otherwise, m/√s
-JOLT = 1e-3  # slip of a tyre while its force jumps, rad/(m/s²); measured where a motor's current jumps by 4.7 A
-SLIDE = 7e-4  # slip of a wheel that grips and carries all of the force, because the other one slips, m/√s
-JUMP = 3.0  # standard deviations; a jump is the part of a change of the acceleration that exceeds them
-LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
-RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
+JOLT_SLIP = 1e-3  # slip of a tyre while its force jumps, rad/(m/s²); measured where a motor's current jumps by 4.7 A
+SLIDE_NOISE = 7e-4  # slip of a wheel that grips and carries all of the force, because the other one slips, m/√s
+JUMP_SIGMAS = 3.0  # standard deviations; a jump is the part of a change of the acceleration that exceeds them
+# s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
+LOADING_TIME, LOADING_JOLT = 0.1, 2.0
+START_RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
-DOUBT = 0.1  # standard deviation of that error where a radius has changed, at most; chosen
-CALM = 0.5  # m/s², acceleration below which no force makes a wheel slip; chosen
+RADIUS_DOUBT = 0.1  # standard deviation of that error where a radius has changed, at most; chosen
+CALM_ACCELERATION = 0.5  # m/s², acceleration below which no force makes a wheel slip; chosen
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
 
 # s, side-slip of the rear axle's path over θ̇: m/C, where C in N·s/m is the side force of the rear tyres over their
 # lateral velocity, less half the physics step (`physics.mjcf` says why); measured on the models of this package.
-SIDE = 0.94e-3
+SIDE_SLIP_TIME = 0.94e-3
 FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
-LOST = 10  # the tenth fix in a row outside the gate is accepted
-LOOSE = 0.5  # m and rad, standard deviation that is added to the posture before
-FIXES = 30  # fixes, time constant of the running mean of their innovations; chosen
-DRIFTING = 4.5  # standard deviations of that mean above which dead reckoning drifts; chosen
-SLIPPED = 6.0  # standard deviations of the innovation of an encoder, above which its wheel has slipped; chosen
-GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
-TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
-AVERAGE = 1.0  # s, time constant of the mean of the wheels' difference, by which another radius is found; chosen
+LOST_FIXES = 10  # the tenth fix in a row outside the gate is accepted
+LOST_DEVIATION = 0.5  # m and rad, standard deviation that is added to the posture before
+INNOVATION_FIXES = 30  # fixes, time constant of the running mean of their innovations; chosen
+DRIFT_SIGMAS = 4.5  # standard deviations of that mean above which dead reckoning drifts; chosen
+SLIP_SIGMAS = 6.0  # standard deviations of the innovation of an encoder, above which its wheel has slipped; chosen
+SLIP_SPEED = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
+GRIP_DIFFERENCE = 2e-3  # m/s, difference of the slip of two wheels that grip
+RADIUS_AVERAGE = 1.0  # s, time constant of the mean of the wheels' difference, by which another radius is found; chosen
 # m/s² and rad/s², standard deviations of V̇ and of the mean θ̈ from where the last sample of a slow sensor was taken to
 # where it is used; chosen
-HELD = 0.5, 1.0
-INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
+HELD_NOISE = 0.5, 1.0
+OBSERVER_BANDWIDTH = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
 
 EKF = np.dtype(
     [
         ("mean", "f8", N),  # estimate of x, in the order and units above
         ("P", "f8", (N, N)),  # its covariance
-        ("kept_mean", "f8", (KEPT, N)),  # estimates at the ticks of fixes that have not arrived
-        ("kept_P", "f8", (KEPT, N, N)),  # their covariances, in the squared units above
-        ("kept_tick", "i8", KEPT),  # these ticks
+        ("kept_mean", "f8", (MAX_STORED, N)),  # estimates at the ticks of fixes that have not arrived
+        ("kept_P", "f8", (MAX_STORED, N, N)),  # their covariances, in the squared units above
+        ("kept_tick", "i8", MAX_STORED),  # these ticks
         ("g", "f8", N),  # scratch: covariance of the state with a measurement, or its derivative by an input
         ("encoder_variance", "f8"),  # rad²
         ("gyro_variance", "f8"),  # (rad/s)²
@@ -86,7 +87,7 @@ EKF = np.dtype(
         ("drift_bound", "f8"),  # on these means; infinite where the fixes are not independent of encoders and gyro
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
-        ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIPPED`, and gyro sample
+        ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIP_SIGMAS`, and gyro sample
     ],
     align=True,
 )
@@ -124,7 +125,7 @@ def propagate(
     r, D = geometry.wheel_radius, geometry.half_track
     middle = T / 2 + geometry.skew  # of the period as positions count it; velocities lag behind them
     v, omega = m[V] + v_dot * middle, m[OMEGA] + omega_dot * middle
-    heading = m[THETA] + omega * (T / 2 - SIDE)  # direction of the motion, which v_y turns outwards
+    heading = m[THETA] + omega * (T / 2 - SIDE_SLIP_TIME)  # direction of the motion, which v_y turns outwards
     c, sn = T * np.cos(heading), T * np.sin(heading)
     grow_left, grow_right = 1 + m[SCALE_LEFT] + growth, 1 + m[SCALE_RIGHT] - growth
     b_left, b_right = T / (r * grow_left), T / (r * grow_right)
@@ -143,7 +144,7 @@ def propagate(
         Q = P.T if transposed else P
         for j in range(N):
             speed, wheels = Q[V, j] - middle * Q[OFFSET, j], Q[V, j] - rolled * Q[OFFSET, j]
-            direction = v * (Q[THETA, j] + (T / 2 - SIDE) * Q[OMEGA, j])
+            direction = v * (Q[THETA, j] + (T / 2 - SIDE_SLIP_TIME) * Q[OMEGA, j])
             Q[X, j] += c * speed - sn * direction
             Q[Y, j] += sn * speed + c * direction
             Q[LEFT, j] += b_left * (wheels - D * Q[OMEGA, j]) - turn_left / grow_left * Q[SCALE_LEFT, j]
@@ -162,14 +163,14 @@ def propagate(
     g[X], g[Y], g[V] = c * middle, sn * middle, T
     g[LEFT], g[RIGHT] = b_left * rolled, b_right * rolled
     excite(s.acceleration_variance, s)
-    across = v * (T / 2 - SIDE) * middle  # by the change of heading
+    across = v * (T / 2 - SIDE_SLIP_TIME) * middle  # by the change of heading
     g[X], g[Y], g[THETA], g[V], g[OMEGA] = -sn * across, c * across, T * middle, 0.0, T
     g[LEFT], g[RIGHT] = -b_left * D * rolled, b_right * D * rolled
-    excite(TURN**2 / T, s)
-    P[V, V] += T * LOOSE_V**2 if gripping == 0 else 0.0
+    excite(YAW_NOISE**2 / T, s)
+    P[V, V] += T * SLIPPING_NOISE**2 if gripping == 0 else 0.0
     P[BIAS, BIAS] += T * s.bias_walk**2
-    P[OFFSET, OFFSET] += T * (s.offset_walk**2 + (s.offset - m[OFFSET]) ** 2 / SETTLE)
-    slip = JOLT**2 * jolt**2 + (T * (SLIDE / r) ** 2 if gripping == 1 else 0.0)
+    P[OFFSET, OFFSET] += T * (s.offset_walk**2 + (s.offset - m[OFFSET]) ** 2 / OFFSET_SETTLING)
+    slip = JOLT_SLIP**2 * jolt**2 + (T * (SLIDE_NOISE / r) ** 2 if gripping == 1 else 0.0)
     P[LEFT, LEFT] += slip
     P[RIGHT, RIGHT] += slip
     P[SCALE_LEFT, SCALE_LEFT] += T * RADIUS_WALK**2
@@ -200,9 +201,9 @@ def measure(now: Row, s: Row) -> None:
     """Updates by encoders and gyro; the encoder of a wheel that slips only resets the angle of that wheel.
 
     A wheel that is braked hard slips by a fraction of a millimetre in one tick, which `find_grip` does not see, and
-    which is many times what an encoder resolves. Where the innovation is above `SLIPPED`, the variance of the wheel's
-    angle is therefore raised until it is not: the angle takes the slip, and the larger the slip is, the less it changes
-    the other states.
+    which is many times what an encoder resolves. Where the innovation is above `SLIP_SIGMAS`, the variance of the
+    wheel's angle is therefore raised until it is not: the angle takes the slip, and the larger the slip is, the less it
+    changes the other states.
     """
     P = s.P
     if now.encoder_new:
@@ -210,7 +211,7 @@ def measure(now: Row, s: Row) -> None:
             wheel = LEFT + k
             if now.grip[k] == 1:
                 residual = now.encoder[k] - s.mean[wheel]
-                P[wheel, wheel] += max(0.0, residual * residual / SLIPPED**2 - P[wheel, wheel] - s.encoder_variance)
+                P[wheel, wheel] += max(0.0, residual * residual / SLIP_SIGMAS**2 - P[wheel, wheel] - s.encoder_variance)
                 for i in range(N):
                     s.g[i] = P[wheel, i]
                 variance = s.g[wheel] + s.encoder_variance
@@ -235,26 +236,26 @@ def find_drift(along: float, turned: float, s: Row) -> None:
 
     The innovations of a filter whose model is right are white, with mean 0. Their running mean,
 
-        m ← m + (z − m)/n,    n = `FIXES`,
+        m ← m + (z − m)/n,    n = `INNOVATION_FIXES`,
 
-    where z is an innovation in its own standard deviations, then has the variance 1/(2n − 1). Where m leaves `DRIFTING`
-    standard deviations, dead reckoning is wrong; the filter takes that for another radius of a wheel. Until it was
-    found out, the error has gone into the bias of the gyro and into the posture, too: the standard deviations of the
-    radii are raised to `DOUBT`, that of the bias to that of the start, and the variances of the posture by those of a
-    fix. Then the mean begins again at 0, so that another error that lasts is found again and again. Fixes by particles,
-    which encoders and gyro move, have no white innovations; there the bound is infinite.
+    where z is an innovation in its own standard deviations, then has the variance 1/(2n − 1). Where m leaves
+    `DRIFT_SIGMAS` standard deviations, dead reckoning is wrong; the filter takes that for another radius of a wheel.
+    Until it was found out, the error has gone into the bias of the gyro and into the posture, too: the standard
+    deviations of the radii are raised to `RADIUS_DOUBT`, that of the bias to that of the start, and the variances of
+    the posture by those of a fix. Then the mean begins again at 0, so that another error that lasts is found again and
+    again. Fixes by particles, which encoders and gyro move, have no white innovations; there the bound is infinite.
 
     Args:
         along: Innovation of the position along the heading, in its standard deviation.
         turned: Innovation of the heading, in its standard deviation.
         s: In and out: a record of `EKF`.
     """
-    s.drift[0] += (along - s.drift[0]) / FIXES
-    s.drift[1] += (turned - s.drift[1]) / FIXES
+    s.drift[0] += (along - s.drift[0]) / INNOVATION_FIXES
+    s.drift[1] += (turned - s.drift[1]) / INNOVATION_FIXES
     if max(abs(s.drift[0]), abs(s.drift[1])) > s.drift_bound:
         P = s.P
         for k in range(SCALE_LEFT, N):
-            P[k, k] = max(P[k, k], DOUBT**2)
+            P[k, k] = max(P[k, k], RADIUS_DOUBT**2)
         P[BIAS, BIAS] = max(P[BIAS, BIAS], s.bias_variance)
         for k in range(3):
             P[k, k] += s.fix_variance[k]
@@ -282,10 +283,10 @@ def absorb_fix(fix: Array, s: Row) -> None:
     ) / determinant  # fmt: skip
     if s.nis > FIX_GATE:
         s.refused += 1
-        if s.refused < LOST:
+        if s.refused < LOST_FIXES:
             return
         for k in range(3):
-            P[k, k] += LOOSE**2
+            P[k, k] += LOST_DEVIATION**2
         s.drift[0] = s.drift[1] = 0.0
     else:
         u, w = np.cos(m[THETA]), np.sin(m[THETA])
@@ -304,14 +305,14 @@ def absorb_fix(fix: Array, s: Row) -> None:
 def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Row) -> None:
     """Decides whether a wheel has another radius than before, as after a puncture, and writes it into the samples.
 
-    While both wheels grip and the acceleration is below `CALM`, no wheel can slip much, and encoders and gyro agree in
-    the mean: with v_l,r = r (1 + s_l,r) φ̇_l,r
+    While both wheels grip and the acceleration is below `CALM_ACCELERATION`, no wheel can slip much, and encoders and
+    gyro agree in the mean: with v_l,r = r (1 + s_l,r) φ̇_l,r
 
-        d ← d + (T/τ) (v_l − v_r + 2 D (θ̇_gyro − b) − d),    τ = `AVERAGE`
+        d ← d + (T/τ) (v_l − v_r + 2 D (θ̇_gyro − b) − d),    τ = `RADIUS_AVERAGE`
 
-    is within four standard deviations of counts, gyro, b and s, plus `TWIST`. Where it is not, a wheel has another
-    radius, and the standard deviations of s_l and s_r are raised to |d|/V, at most `DOUBT`. The gyro then tells their
-    difference, and the fixes tell their sum.
+    is within four standard deviations of counts, gyro, b and s, plus `GRIP_DIFFERENCE`. Where it is not, a wheel has
+    another radius, and the standard deviations of s_l and s_r are raised to |d|/V, at most `RADIUS_DOUBT`. The gyro
+    then tells their difference, and the fixes tell their sum.
 
     Args:
         difference: v_l − v_r + 2 D (θ̇_gyro − b) in m/s.
@@ -320,16 +321,16 @@ def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Ro
         period: Control period in s.
         s: In and out: a record of `EKF`.
     """
-    if np.hypot(now.acceleration[0] - s.offset, now.acceleration[1]) > CALM:
+    if np.hypot(now.acceleration[0] - s.offset, now.acceleration[1]) > CALM_ACCELERATION:
         return
-    s.difference += period / AVERAGE * (difference - s.difference)
+    s.difference += period / RADIUS_AVERAGE * (difference - s.difference)
     P, u, D = s.P, s.inertial, geometry.half_track
-    variance = 2 * (geometry.wheel_radius / AVERAGE) ** 2 * s.encoder_variance
-    variance += 4 * D * D * (s.gyro_variance * period / (2 * AVERAGE) + P[BIAS, BIAS])
+    variance = 2 * (geometry.wheel_radius / RADIUS_AVERAGE) ** 2 * s.encoder_variance
+    variance += 4 * D * D * (s.gyro_variance * period / (2 * RADIUS_AVERAGE) + P[BIAS, BIAS])
     variance += u * u * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT] - 2 * P[SCALE_LEFT, SCALE_RIGHT])
     variance -= 4 * D * u * (P[BIAS, SCALE_LEFT] - P[BIAS, SCALE_RIGHT])
-    if abs(s.difference) > 4 * np.sqrt(variance) + TWIST:
-        now.doubt = min(abs(s.difference) / max(abs(u), TWIST), DOUBT)
+    if abs(s.difference) > 4 * np.sqrt(variance) + GRIP_DIFFERENCE:
+        now.doubt = min(abs(s.difference) / max(abs(u), GRIP_DIFFERENCE), RADIUS_DOUBT)
         s.difference = 0.0
 
 
@@ -341,10 +342,10 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
 
         V ← V + T (a − o) + 2 ω₀ T e,    o ← o − ω₀² T e,    e = mean of v_l,r − (V ∓ D ω) over the wheels that grip
 
-    It has the bandwidth ω₀ = `INERTIAL`, and its offset o is faster than that of the filter. A wheel slips if its own
-    difference is larger than `GRIP` plus one count, or if it is the larger one and the two together contradict the
-    gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by three times
-    `HELD` then.
+    It has the bandwidth ω₀ = `OBSERVER_BANDWIDTH`, and its offset o is faster than that of the filter. A wheel slips if
+    its own difference is larger than `SLIP_SPEED` plus one count, or if it is the larger one and the two together
+    contradict the gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by
+    three times `HELD_NOISE` then.
 
     Args:
         now: In and out: a record of `SAMPLE`, whose `grip` and `doubt` are the result.
@@ -356,8 +357,8 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     r, D = geometry.wheel_radius, geometry.half_track
     omega = now.gyro - s.mean[BIAS]
     ahead = s.inertial + period * (now.acceleration[0] + geometry.imu_x * omega * omega - s.offset)
-    waits, turn = period * (sensor.accelerometer_every - 1), HELD[1] * period * (sensor.gyro_every - 1)
-    bound = GRIP + r * sensor.quantum / (period * sensor.encoder_every) + 3 * (HELD[0] * waits + D * turn)
+    waits, turn = period * (sensor.accelerometer_every - 1), HELD_NOISE[1] * period * (sensor.gyro_every - 1)
+    bound = SLIP_SPEED + r * sensor.quantum / (period * sensor.encoder_every) + 3 * (HELD_NOISE[0] * waits + D * turn)
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound
@@ -367,14 +368,14 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     spread = 4 * (r / (period * sensor.encoder_every)) ** 2 * s.encoder_variance
     spread += 4 * D * D * (s.gyro_variance + turn * turn + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
-    if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # by the gyro, one of them slips
+    if abs(left - right) > 4 * np.sqrt(spread) + GRIP_DIFFERENCE:  # by the gyro, one of them slips
         wheel = 0 if abs(left) > abs(right) else 1
         now.grip[wheel] = 0
     count = now.grip[0] + now.grip[1]
     if count > 0:
         mean = (now.grip[0] * left + now.grip[1] * right) / count
-        ahead += 2 * INERTIAL * period * mean
-        s.offset -= INERTIAL**2 * period * mean
+        ahead += 2 * OBSERVER_BANDWIDTH * period * mean
+        s.offset -= OBSERVER_BANDWIDTH**2 * period * mean
     s.inertial = ahead
 
 
@@ -385,9 +386,9 @@ def step(t: int, ring: Rows, i: int, geometry: Row, period: float, delay: int, s
     omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
     forward = now.acceleration[0] + geometry.imu_x * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
     jolt = abs(now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0])
-    jolt = max(0.0, jolt - JUMP * np.sqrt(2 * s.acceleration_variance))
-    if (t - start) * period < LOADING:
-        jolt = max(jolt, LOAD)
+    jolt = max(0.0, jolt - JUMP_SIGMAS * np.sqrt(2 * s.acceleration_variance))
+    if (t - start) * period < LOADING_TIME:
+        jolt = max(jolt, LOADING_JOLT)
     if now.grip[0] + now.grip[1] == 0:  # o is not observed, and its last correction would be integrated
         for n in range(N):
             s.P[OFFSET, n] = s.P[n, OFFSET] = 0.0
@@ -403,7 +404,7 @@ def step(t: int, ring: Rows, i: int, geometry: Row, period: float, delay: int, s
 def keep(t: int, s: Row) -> None:
     """Stores the state of a tick in which a fix was taken, in place of the oldest one."""
     oldest = 0
-    for k in range(KEPT):
+    for k in range(MAX_STORED):
         if s.kept_tick[k] == t:
             oldest = k
             break
@@ -433,7 +434,7 @@ def ekf(
     f, now = memory, front(tick, sensor)
     taken = tick - sensor.fix_latency  # when the fix that arrives now was taken
     if s.start <= taken < now and ring[taken % len(ring), i].fix_arrives:
-        for k in range(KEPT):
+        for k in range(MAX_STORED):
             if f.kept_tick[k] == taken:
                 go_back(k, f)
                 absorb_fix(ring[taken % len(ring), i].fix, f)

@@ -12,7 +12,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from mrctl.kernel import Array, Held, Kernel, Row, Rows, held, kernel
-from mrctl.sensing.ekf import DRIFTING, EKF, FIXES, HELD, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
+from mrctl.sensing.ekf import (
+    DRIFT_SIGMAS,
+    EKF,
+    HELD_NOISE,
+    INCLINE_WALK,
+    INNOVATION_FIXES,
+    START_OFFSET,
+    START_RADIUS,
+    START_TWIST,
+    ekf,
+)
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.scanner import Scanner
@@ -33,7 +43,7 @@ GEOMETRY = np.dtype(
     ],
     align=True,
 )
-MOTION = np.dtype(
+SAMPLED_MOTION = np.dtype(
     [
         ("mean", "f8", 5),  # x, y in m, θ in rad, V in m/s, θ̇ in rad/s, when the last samples were taken
         ("answer", "f8", 5),  # estimate of a user's estimator, in the same order
@@ -171,10 +181,10 @@ def sense(tick: int, plant: Rows, derivative: Array, period: float, place: int) 
 
 
 ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
-    "truth": (truth, MOTION),
-    "odometry": (odometry, MOTION),
+    "truth": (truth, SAMPLED_MOTION),
+    "odometry": (odometry, SAMPLED_MOTION),
     "ekf": (ekf, EKF),
-    "user": (user, MOTION),
+    "user": (user, SAMPLED_MOTION),
 }
 """Kernel and state of each estimator; `user` passes on the estimate of a user's estimator."""
 
@@ -272,16 +282,16 @@ class Estimator:
         sensing, sensor, memory = self._sensing[row], self.sensors.sensors[row], self.memory[row]
         offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
         count = sensor["quantum"] ** 2 / 12
-        variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, count, count, RADIUS**2, RADIUS**2]
-        held = HELD[0] if sensor["accelerometer_every"] > 1 else 0.0
+        variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, count, count, START_RADIUS**2, START_RADIUS**2]
+        held = HELD_NOISE[0] if sensor["accelerometer_every"] > 1 else 0.0
         memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2 + held**2
-        memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
+        memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE_WALK)
         memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
         memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2
         memory["bias_variance"], memory["bias_walk"] = sensing["gyro_bias"] ** 2, sensing["gyro_walk"]
         memory["kept_tick"] = -1
         own = sensing.localisation == "particles"  # moved by encoders and gyro, so that errors of fixes last
-        memory["drift_bound"] = np.inf if own else DRIFTING / np.sqrt(2 * FIXES - 1)
+        memory["drift_bound"] = np.inf if own else DRIFT_SIGMAS / np.sqrt(2 * INNOVATION_FIXES - 1)
         memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
         memory["inertial"] = memory["mean"][3]
 

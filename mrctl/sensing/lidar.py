@@ -13,7 +13,7 @@ from mrctl.record import Record, is_whole
 from mrctl.theory.obstacles import Outlines, turned
 from mrctl.theory.rays import cast
 
-SHY = 0.2  # m before what a beam met, up to which there is nothing for sure
+FREE_MARGIN = 0.2  # m before what a beam met, up to which there is nothing for sure
 
 
 class Lidar(Record):
@@ -97,8 +97,8 @@ class Lidar(Record):
     def rays(self, ranges: Array, most: int) -> Array:
         """Returns the parts of beams of a scan on which there is nothing.
 
-        They end `SHY` before what the beam met, or at the largest range. A beam that returns nothing though it meets
-        an obstacle is not told from one that meets none.
+        They end `FREE_MARGIN` before what the beam met, or at the largest range. A beam that returns nothing though it
+        meets an obstacle is not told from one that meets none.
 
         Args:
             ranges: Ranges of a scan in m, `(beams,)`.
@@ -108,7 +108,7 @@ class Lidar(Record):
             x and y of start and end in the robot's frame in m, `(n, 4)`.
         """
         used = thinned(np.arange(self.beams), most)
-        free = np.where(np.isfinite(ranges[used]), ranges[used] - SHY, self.range)
+        free = np.where(np.isfinite(ranges[used]), ranges[used] - FREE_MARGIN, self.range)
         ends = self._ends(used[free > 0], free[free > 0])
         return np.column_stack([np.full(len(ends), self.x), np.zeros(len(ends)), ends])
 

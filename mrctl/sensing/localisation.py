@@ -12,7 +12,7 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.sensing.particles import MOST, SPREAD, TRIALS, Particles, anywhere, best_of, free
+from mrctl.sensing.particles import MAX_PARTICLES, MIN_START_DEVIATION, RANDOM_POSES, Particles, anywhere, best_of, free
 from mrctl.sensing.scan_matching import agreement, match
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
@@ -20,10 +20,10 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.grid import field_of, map_area
 from mrctl.theory.obstacles import Obstacles, Surroundings
 
-POINTS = {"scan": 120, "particles": 60}  # largest number of points of a scan that are used
-RAYS = 20  # largest number of beams that are followed through the map
-SETTLED = 0.2  # m between fix and estimate in x and y, below which a search has ended
-AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
+MAX_POINTS = {"scan": 120, "particles": 60}  # largest number of points of a scan that are used
+MAX_RAYS = 20  # largest number of beams that are followed through the map
+SETTLED_DISTANCE = 0.2  # m between fix and estimate in x and y, below which a search has ended
+MIN_AGREEMENT = 0.5  # share of the points of a scan that must lie on the map for a fix
 
 
 class Localiser:
@@ -84,12 +84,12 @@ class Localiser:
             return pose, deviation
         unknown = sensing.start_unknown
         if sensing.localisation == "particles":
-            spread = np.maximum(deviation, SPREAD)
+            spread = np.maximum(deviation, MIN_START_DEVIATION)
             self.filters[row] = Particles(chart, seed, None if unknown else pose.copy(), spread)
         elif unknown:
-            self._sought[row] = anywhere(free(chart), MOST, random)
+            self._sought[row] = anywhere(free(chart), MAX_PARTICLES, random)
         elif sensing.start_position_noise or sensing.start_heading_noise:
-            self._sought[row] = pose + deviation * random.standard_normal((TRIALS, 3))
+            self._sought[row] = pose + deviation * random.standard_normal((RANDOM_POSES, 3))
         if not unknown:
             return pose, deviation
         places = free(chart)
@@ -111,11 +111,14 @@ class Localiser:
             sensing, scan, chart = self._sensing[row], self._scanner.scans[row], self._maps[row]
             if sensing.localisation == "fixes" or scan is None or chart is None:
                 continue
-            points, rays = sensing.lidar.points(scan, POINTS[sensing.localisation]), sensing.lidar.rays(scan, RAYS)
+            points, rays = (
+                sensing.lidar.points(scan, MAX_POINTS[sensing.localisation]),
+                sensing.lidar.rays(scan, MAX_RAYS),
+            )
             if particles := self.filters[row]:
                 found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points, rays)
                 # Of a scan that shows nothing of the map the mean is odometry, which the filter has already.
-                now["fix_arrives"][row] &= agreement.compiled(points, found, chart) >= AGREES
+                now["fix_arrives"][row] &= agreement.compiled(points, found, chart) >= MIN_AGREEMENT
             elif (poses := self._sought[row]) is not None:
                 way, turn = self._odometry[row]
                 heading = poses[:, 2] + turn / 2
@@ -124,9 +127,9 @@ class Localiser:
                 )
                 best, _ = best_of(poses, points, rays, chart, self._random[row])
                 found, share = best[0], agreement.compiled(points, best[0], chart)
-                now["fix_arrives"][row] &= share >= AGREES
-                self._sought[row] = best if share >= AGREES else poses
-                if begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED:
+                now["fix_arrives"][row] &= share >= MIN_AGREEMENT
+                self._sought[row] = best if share >= MIN_AGREEMENT else poses
+                if begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED_DISTANCE:
                     self._sought[row] = None
             elif not begun[row]:  # there is no estimate yet
                 now["fix_arrives"][row] = False
@@ -137,5 +140,5 @@ class Localiser:
                     [x + v * period * np.cos(theta), y + v * period * np.sin(theta), theta + omega * period]
                 )
                 found, share = match(points, guess, chart)
-                now["fix_arrives"][row] &= share >= AGREES
+                now["fix_arrives"][row] &= share >= MIN_AGREEMENT
             now["fix"][row], self._odometry[row] = found, 0.0

@@ -16,21 +16,26 @@ from mrctl.kernel import Array, kernel
 from mrctl.sensing.scan_matching import agreement, fit
 from mrctl.theory.grid import Field
 
-LEAST, MOST = 500, 10_000  # particles
-HIT, RANDOM = 0.05, 0.05  # m, deviation of a point from the map; likelihood of a point that the map does not explain
+MIN_PARTICLES, MAX_PARTICLES = 500, 10_000  # particles
+# m, deviation of a point from the map; likelihood of a point that the map does not explain
+HIT_DEVIATION, RANDOM_LIKELIHOOD = 0.05, 0.05
 TRUST = 0.6
-ALONG, TURN, DRIFT = 0.05, 0.05, 0.05  # deviations of way and turn as shares of them, and of the turn in rad per m
-STILL = 2e-3, 2e-3  # m and rad, deviations of an update without motion
-BIN = 0.1, 0.1, 0.2  # m, m and rad, bin sizes; the number of occupied bins sets the number of particles
-ERROR, QUANTILE = 0.05, 2.326  # bound on the Kullback-Leibler distance, kept with probability 99 %
-CLUSTER = 0.5  # m and rad, distance from the best particle within which particles are averaged
-AGREE = 0.8  # share of a scan's points that lie on the map, below which the filter is taken for lost
-RESET, CLOSE = 0.2, 0.02  # share of the particles that are then drawn from the scan; deviation about it in m and rad
-SPREAD = 0.1  # m and rad, least deviation of the particles at the start
-TRIALS, SEEDS, KEPT = 4000, 40, 5  # random poses, those matched with the scan, and the best, which seed particles
-APART = 0.3  # m and rad, least distance between them
-COARSE, FINER = 0.5, 0.2  # m, deviation of a point from the map by which random poses are judged, and those around them
-NEAR, AROUND = 0.15, 50  # m and rad, deviation of such poses, and their number
+# deviations of way and turn as shares of them, and of the turn in rad per m
+WAY_NOISE, TURN_NOISE, DRIFT_NOISE = 0.05, 0.05, 0.05
+REST_NOISE = 2e-3, 2e-3  # m and rad, deviations of an update without motion
+BIN_SIZES = 0.1, 0.1, 0.2  # m, m and rad, bin sizes; the number of occupied bins sets the number of particles
+KLD_BOUND, KLD_QUANTILE = 0.05, 2.326  # bound on the Kullback-Leibler distance, kept with probability 99 %
+CLUSTER_RADIUS = 0.5  # m and rad, distance from the best particle within which particles are averaged
+LOST_AGREEMENT = 0.8  # share of a scan's points that lie on the map, below which the filter is taken for lost
+# share of the particles that are then drawn from the scan; deviation about it in m and rad
+RESET_SHARE, RESET_DEVIATION = 0.2, 0.02
+MIN_START_DEVIATION = 0.1  # m and rad, least deviation of the particles at the start
+# random poses, those matched with the scan, and the best, which seed particles
+RANDOM_POSES, MATCHED_POSES, SEED_POSES = 4000, 40, 5
+SEED_DISTANCE = 0.3  # m and rad, least distance between them
+# m, deviation of a point from the map by which random poses are judged, and those around them
+COARSE_DEVIATION, FINER_DEVIATION = 0.5, 0.2
+NEIGHBOUR_DEVIATION, NEIGHBOURS = 0.15, 50  # m and rad, deviation of such poses, and their number
 
 
 class Particles:
@@ -55,12 +60,12 @@ class Particles:
         self._free = free(field)
         self._sought: Array | None = None  # poses from which the first scan is matched, `(n, 3)`
         if start is None:
-            self.particles = self._sought = anywhere(self._free, MOST, self._random)
+            self.particles = self._sought = anywhere(self._free, MAX_PARTICLES, self._random)
         else:
-            deviation = np.full(3, SPREAD) if spread is None else spread
-            self.particles = start + deviation * self._random.standard_normal((LEAST, 3))
-            if np.any(deviation > SPREAD):
-                self._sought = start + deviation * self._random.standard_normal((TRIALS, 3))
+            deviation = np.full(3, MIN_START_DEVIATION) if spread is None else spread
+            self.particles = start + deviation * self._random.standard_normal((MIN_PARTICLES, 3))
+            if np.any(deviation > MIN_START_DEVIATION):
+                self._sought = start + deviation * self._random.standard_normal((RANDOM_POSES, 3))
         self.pose, self.spread = self.particles.mean(axis=0), self.particles.std(axis=0)
 
     def update(self, way: float, turn: float, points: Array, rays: Array) -> Array:
@@ -77,23 +82,23 @@ class Particles:
             `pose`, `(3,)`.
         """
         random, n = self._random, len(self.particles)
-        looked_for = rays if self._sought is not None or n > LEAST else rays[:0]
+        looked_for = rays if self._sought is not None or n > MIN_PARTICLES else rays[:0]
         if self._sought is not None:
             best, shares = best_of(self._sought, points, rays, self._field, random)
-            count, self._sought = int(RESET * n), None
+            count, self._sought = int(RESET_SHARE * n), None
             drawn = best[random.choice(len(best), count, p=shares)]
-            self.particles[:count] = drawn + CLOSE * random.standard_normal((count, 3))
+            self.particles[:count] = drawn + RESET_DEVIATION * random.standard_normal((count, 3))
         move.compiled(self.particles, way, turn, random.standard_normal((n, 3)))
-        weights = likelihoods(self.particles, points, looked_for, self._field, HIT)
+        weights = likelihoods(self.particles, points, looked_for, self._field, HIT_DEVIATION)
         average.compiled(self.particles, weights, self.pose, self.spread)
-        lost = len(points) > 0 and agreement.compiled(points, self.pose, self._field) < AGREE
+        lost = len(points) > 0 and agreement.compiled(points, self.pose, self._field) < LOST_AGREEMENT
         fresh = np.zeros((1, 3))
         if lost:
-            fresh = best_of(anywhere(self._free, TRIALS, random), points, rays, self._field, random)[0]
-        found = np.empty((MOST, 3))
+            fresh = best_of(anywhere(self._free, RANDOM_POSES, random), points, rays, self._field, random)[0]
+        found = np.empty((MAX_PARTICLES, 3))
         count = resample.compiled(
-            self.particles, weights, random.uniform(size=(MOST, 2)), random.standard_normal((MOST, 3)), fresh,
-            RESET * lost, found,
+            self.particles, weights, random.uniform(size=(MAX_PARTICLES, 2)),
+            random.standard_normal((MAX_PARTICLES, 3)), fresh, RESET_SHARE * lost, found,
         )  # fmt: skip
         self.particles = found[:count].copy()
         return self.pose
@@ -125,20 +130,20 @@ def best_of(poses: Array, points: Array, rays: Array, field: Field, random: np.r
         random: Source of random numbers.
 
     Returns:
-        The `KEPT` likeliest of the matched poses, or fewer, none near another, the likeliest first, `(m, 3)`; and their
-        probabilities, for which the density of the given poses is the prior, `(m,)`.
+        The `SEED_POSES` likeliest of the matched poses, or fewer, none near another, the likeliest first, `(m, 3)`; and
+        their probabilities, for which the density of the given poses is the prior, `(m,)`.
     """
     few = points[:: max(1, len(points) // 20)]
-    seeds = poses[apart(poses, likelihoods(poses, few, rays[:0], field, COARSE), SEEDS)]
-    around = seeds[:, None] + NEAR * random.standard_normal((len(seeds), AROUND, 3))
+    seeds = poses[apart(poses, likelihoods(poses, few, rays[:0], field, COARSE_DEVIATION), MATCHED_POSES)]
+    around = seeds[:, None] + NEIGHBOUR_DEVIATION * random.standard_normal((len(seeds), NEIGHBOURS, 3))
     around[:, 0] = seeds
-    weights = likelihoods(around.reshape(-1, 3), few, rays[:0], field, FINER).reshape(around.shape[:2])
+    weights = likelihoods(around.reshape(-1, 3), few, rays[:0], field, FINER_DEVIATION).reshape(around.shape[:2])
     found = around[np.arange(len(seeds)), weights.argmax(axis=1)]
     for pose in found:
         fit.compiled(points, pose, field)
     near = [1 + np.count_nonzero(within(poses, pose)) for pose in found]
-    weights = near * likelihoods(found, points, rays, field, HIT)
-    best = apart(found, weights, KEPT)
+    weights = near * likelihoods(found, points, rays, field, HIT_DEVIATION)
+    best = apart(found, weights, SEED_POSES)
     return found[best], weights[best] / weights[best].sum()
 
 
@@ -159,16 +164,20 @@ def apart(poses: Array, weights: Array, most: int) -> NDArray[np.intp]:
 
 
 def within(poses: Array, pose: Array) -> NDArray[np.bool]:
-    """Tells which poses are less than `APART` from another one in x, y and θ."""
+    """Tells which poses are less than `SEED_DISTANCE` from another one in x, y and θ."""
     away = np.abs(poses - pose)
     away[:, 2] = np.abs(np.angle(np.exp(1j * away[:, 2])))
-    return np.all(away <= APART, axis=1)
+    return np.all(away <= SEED_DISTANCE, axis=1)
 
 
 @kernel
 def move(particles: Array, way: float, turn: float, noise: Array) -> None:
     """Moves particles by a distance in m and a turn in rad, with noise that grows with both; arrays are `(n, 3)`."""
-    along, across, about = STILL[0] + ALONG * abs(way), STILL[0], STILL[1] + TURN * abs(turn) + DRIFT * abs(way)
+    along, across, about = (
+        REST_NOISE[0] + WAY_NOISE * abs(way),
+        REST_NOISE[0],
+        REST_NOISE[1] + TURN_NOISE * abs(turn) + DRIFT_NOISE * abs(way),
+    )
     for i in range(len(particles)):
         turned = turn + about * noise[i, 0]
         heading = particles[i, 2] + turned / 2
@@ -181,10 +190,10 @@ def move(particles: Array, way: float, turn: float, noise: Array) -> None:
 
 @kernel
 def weigh(particles: Array, points: Array, rays: Array, field: Field, deviation: float, weights: Array) -> None:
-    """Weighs particles by the likelihood field, p = exp(−d²/2σ²) + `RANDOM` for each point of the scan.
+    """Weighs particles by the likelihood field, p = exp(−d²/2σ²) + `RANDOM_LIKELIHOOD` for each point of the scan.
 
-    For each ray p = `RANDOM` if the map has something on it, and 1 + `RANDOM` otherwise: so a robot does not look
-    through a wall, at points that lie on another one, or see nothing where there is one.
+    For each ray p = `RANDOM_LIKELIHOOD` if the map has something on it, and 1 + `RANDOM_LIKELIHOOD` otherwise: so a
+    robot does not look through a wall, at points that lie on another one, or see nothing where there is one.
 
     Args:
         particles: Poses in m, m, rad, `(n, 3)`.
@@ -207,9 +216,9 @@ def weigh(particles: Array, points: Array, rays: Array, field: Field, deviation:
             column, row = x + c * points[m, 0] - s * points[m, 1], y + s * points[m, 0] + c * points[m, 1]
             if 0.0 <= column < columns and 0.0 <= row < rows:
                 d = distance[int(row), int(column)]
-                product *= np.exp(-0.5 * (d / deviation) ** 2) + RANDOM
+                product *= np.exp(-0.5 * (d / deviation) ** 2) + RANDOM_LIKELIHOOD
             else:
-                product *= RANDOM
+                product *= RANDOM_LIKELIHOOD
             if product < 1e-200:
                 log += np.log(product)
                 product = 1.0
@@ -217,7 +226,7 @@ def weigh(particles: Array, points: Array, rays: Array, field: Field, deviation:
         for m in range(len(rays)):
             x0, y0 = x + c * rays[m, 0] - s * rays[m, 1], y + s * rays[m, 0] + c * rays[m, 1]
             x1, y1 = x + c * rays[m, 2] - s * rays[m, 3], y + s * rays[m, 2] + c * rays[m, 3]
-            log += np.log((1.0 if is_free(distance, resolution, x0, y0, x1, y1) else 0.0) + RANDOM)
+            log += np.log((1.0 if is_free(distance, resolution, x0, y0, x1, y1) else 0.0) + RANDOM_LIKELIHOOD)
         weights[i] = log
         most = max(most, log)
     total = 0.0
@@ -271,7 +280,7 @@ def average(particles: Array, weights: Array, pose: Array, spread: Array) -> Non
         for k in range(3):
             e[k] = particles[i, k] - particles[best, k]
         e[2] -= 2 * np.pi * np.round(e[2] / (2 * np.pi))
-        if e[0] * e[0] + e[1] * e[1] > CLUSTER**2 or abs(e[2]) > CLUSTER:
+        if e[0] * e[0] + e[1] * e[1] > CLUSTER_RADIUS**2 or abs(e[2]) > CLUSTER_RADIUS:
             continue
         total += weights[i]
         for k in range(3):
@@ -294,31 +303,31 @@ def resample(
     Args:
         particles: Poses in m, m, rad, `(n, 3)`.
         weights: Their weights, `(n,)`.
-        chance: Uniform random numbers, `(MOST, 2)`.
-        noise: Normal random numbers, `(MOST, 3)`.
+        chance: Uniform random numbers, `(MAX_PARTICLES, 2)`.
+        noise: Normal random numbers, `(MAX_PARTICLES, 3)`.
         fresh: Poses for a lost filter in m, m, rad, `(m, 3)`.
         lost: Share of the particles that are drawn about these poses.
-        found: Out: the new particles, `(MOST, 3)`.
+        found: Out: the new particles, `(MAX_PARTICLES, 3)`.
 
     Returns:
         Number of new particles.
     """
     summed = np.cumsum(weights)
-    table = np.full(4 * MOST, -1, np.int64)  # bins that are occupied, open addressing
-    bins, wanted, n = 0, LEAST, 0
+    table = np.full(4 * MAX_PARTICLES, -1, np.int64)  # bins that are occupied, open addressing
+    bins, wanted, n = 0, MIN_PARTICLES, 0
     while n < wanted:
         if chance[n, 1] < lost:
             own = fresh[int(chance[n, 0] * len(fresh))]
             for k in range(3):
-                found[n, k] = own[k] + CLOSE * noise[n, k]
+                found[n, k] = own[k] + RESET_DEVIATION * noise[n, k]
         else:
             chosen = min(np.searchsorted(summed, chance[n, 0] * summed[-1]), len(particles) - 1)
             for k in range(3):
                 found[n, k] = particles[chosen, k]
         heading = found[n, 2] - 2 * np.pi * np.floor(found[n, 2] / (2 * np.pi))
-        key = np.int64(np.floor(found[n, 0] / BIN[0])) * 73_856_093
-        key = key ^ (np.int64(np.floor(found[n, 1] / BIN[1])) * 19_349_663)
-        key = (key ^ (np.int64(np.floor(heading / BIN[2])) * 83_492_791)) & 0x7FFFFFFFFFFF
+        key = np.int64(np.floor(found[n, 0] / BIN_SIZES[0])) * 73_856_093
+        key = key ^ (np.int64(np.floor(found[n, 1] / BIN_SIZES[1])) * 19_349_663)
+        key = (key ^ (np.int64(np.floor(heading / BIN_SIZES[2])) * 83_492_791)) & 0x7FFFFFFFFFFF
         place = key % len(table)
         while table[place] >= 0 and table[place] != key:
             place = (place + 1) % len(table)
@@ -327,7 +336,7 @@ def resample(
             bins += 1
             if bins > 1:
                 a = 2 / (9 * (bins - 1.0))
-                bound = (bins - 1) / (2 * ERROR) * (1 - a + np.sqrt(a) * QUANTILE) ** 3
-                wanted = int(min(max(bound, LEAST), MOST))
+                bound = (bins - 1) / (2 * KLD_BOUND) * (1 - a + np.sqrt(a) * KLD_QUANTILE) ** 3
+                wanted = int(min(max(bound, MIN_PARTICLES), MAX_PARTICLES))
         n += 1
     return n

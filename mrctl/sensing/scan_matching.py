@@ -3,10 +3,10 @@
     minimise  Σ ρ(d(T p))  + (ξ − ξ₀)ᵀ Λ₀ (ξ − ξ₀)
 
 over the pose ξ, where d is the distance field of the map, T p a point of the scan in the world, and ρ the function of
-Geman and McClure, which discounts points that the map does not explain. Its width shrinks from `WIDE` to `NARROW`, so
-that a guess may be some decimetres wrong; where the result explains too little of the scan, the search starts again
-beside it. The prior Λ₀ about the start ξ₀ holds what the scan does not determine, such as the position along a
-corridor. (Kohlbrecher, von Stryk, Meyer and Klingauf, "A flexible and scalable SLAM system with full 3D motion
+Geman and McClure, which discounts points that the map does not explain. Its width shrinks from `FIRST_WIDTH` to
+`LAST_WIDTH`, so that a guess may be some decimetres wrong; where the result explains too little of the scan, the search
+starts again beside it. The prior Λ₀ about the start ξ₀ holds what the scan does not determine, such as the position
+along a corridor. (Kohlbrecher, von Stryk, Meyer and Klingauf, "A flexible and scalable SLAM system with full 3D motion
 estimation", IEEE SSRR 2011, for the method on a map; Yang et al., IEEE RA-L 5(2), 2020, for the width that shrinks.)
 """
 
@@ -17,12 +17,14 @@ import numpy as np
 from mrctl.kernel import Array, kernel
 from mrctl.theory.grid import Field, at
 
-WIDE, NARROW, SHRINK = 0.5, 0.05, 0.75  # m, m and the factor of one step
-STEPS = 20
-PRIOR = 1.0, 1.0, 1.0  # Λ₀ in points per m², m² and rad²; a scan has a hundred points
-AGREE = 0.8  # share of points on the map, below which the search also starts from beside the guess
-AROUND = np.array([[0, 0, 0], *([x, y, t] for t in (-0.2, 0.2) for x, y in ((0.2, 0), (-0.2, 0), (0, 0.2), (0, -0.2)))])
-INLIER = 0.1  # m, distance up to which a point lies on the map
+FIRST_WIDTH, LAST_WIDTH, WIDTH_FACTOR = 0.5, 0.05, 0.75  # m, m and the factor of one step
+MAX_STEPS = 20
+PRIOR_INFORMATION = 1.0, 1.0, 1.0  # Λ₀ in points per m², m² and rad²; a scan has a hundred points
+SURE_AGREEMENT = 0.8  # share of points on the map, below which the search also starts from beside the guess
+START_OFFSETS = np.array(
+    [[0, 0, 0], *([x, y, t] for t in (-0.2, 0.2) for x, y in ((0.2, 0), (-0.2, 0), (0, 0.2), (0, -0.2)))]
+)
+INLIER_DISTANCE = 0.1  # m, distance up to which a point lies on the map
 
 
 def match(points: Array, guess: Array, field: Field) -> tuple[Array, float]:
@@ -37,12 +39,12 @@ def match(points: Array, guess: Array, field: Field) -> tuple[Array, float]:
         Pose in m, m, rad, `(3,)`, and the share of the points that then lie within 10 cm of the map.
     """
     best, share = np.array(guess, float), -1.0
-    for offset in AROUND:
+    for offset in START_OFFSETS:
         pose = guess + offset
         found = fit.compiled(points, pose, field)
         if found > share:
             best, share = pose, found
-        if share > AGREE:
+        if share > SURE_AGREEMENT:
             break
     return best, share
 
@@ -52,11 +54,11 @@ def fit(points: Array, pose: Array, field: Field) -> float:
     """Improves the pose in place from one start, and returns the share of the points on the map; see `match`."""
     guess = pose.copy()
     H, g = np.empty((3, 3)), np.empty(3)
-    width = WIDE
-    for _ in range(STEPS):
+    width = FIRST_WIDTH
+    for _ in range(MAX_STEPS):
         H[:, :], g[:] = 0.0, 0.0
         for k in range(3):
-            H[k, k], g[k] = PRIOR[k], PRIOR[k] * (pose[k] - guess[k])
+            H[k, k], g[k] = PRIOR_INFORMATION[k], PRIOR_INFORMATION[k] * (pose[k] - guess[k])
         c, s = np.cos(pose[2]), np.sin(pose[2])
         for n in range(len(points)):
             px, py = points[n, 0], points[n, 1]
@@ -77,9 +79,9 @@ def fit(points: Array, pose: Array, field: Field) -> float:
         step = np.linalg.solve(H, g)
         for k in range(3):
             pose[k] -= step[k]
-        if width == NARROW and abs(step[0]) + abs(step[1]) + abs(step[2]) < 1e-6:
+        if width == LAST_WIDTH and abs(step[0]) + abs(step[1]) + abs(step[2]) < 1e-6:
             break
-        width = max(NARROW, SHRINK * width)
+        width = max(LAST_WIDTH, WIDTH_FACTOR * width)
     return agreement(points, pose, field)
 
 
@@ -89,5 +91,5 @@ def agreement(points: Array, pose: Array, field: Field) -> float:
     c, s, count = np.cos(pose[2]), np.sin(pose[2]), 0
     for n in range(len(points)):
         x, y = pose[0] + c * points[n, 0] - s * points[n, 1], pose[1] + s * points[n, 0] + c * points[n, 1]
-        count += abs(at(field, x, y)[0]) < INLIER
+        count += abs(at(field, x, y)[0]) < INLIER_DISTANCE
     return count / max(len(points), 1)

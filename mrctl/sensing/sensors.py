@@ -9,8 +9,8 @@ import numpy as np
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.sensing.tiers import Sensing
 
-BLOCK = 256  # control ticks whose noise is drawn at once
-OUTLIER = 1.0  # m, largest error of an outlying fix in x and y
+NOISE_BLOCK = 256  # control ticks whose noise is drawn at once
+MAX_OUTLIER = 1.0  # m, largest error of an outlying fix in x and y
 
 SENSOR = np.dtype(
     [
@@ -112,7 +112,7 @@ def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, n
     for k in range(3):
         now.fix[k] = reading.pose[k] + s.fix_sigma[k // 2] * noise.fix[k]
         if wrong and k < 2:
-            now.fix[k] += OUTLIER * (2 * noise.chance[2 + k] - 1)
+            now.fix[k] += MAX_OUTLIER * (2 * noise.chance[2 + k] - 1)
     for k in range(2):
         now.grip[k], now.command[k] = 1, 0.0
     now.doubt = 0.0
@@ -139,7 +139,8 @@ class Sensors:
 
     Attributes:
         period: Control period in s.
-        noise: Random numbers of a block of ticks, records of `NOISE`, `(BLOCK, B)`; `(1, B)` zeros if none are needed.
+        noise: Random numbers of a block of ticks, records of `NOISE`, `(NOISE_BLOCK, B)`; `(1, B)` zeros if none are
+            needed.
         ring: Samples of the last N ticks, records of `SAMPLE`, `(N, B)`; row tick % N holds those of a tick.
         sensors: Constants and biases of each robot's sensors, a record of `SENSOR`, `(B,)`.
     """
@@ -162,7 +163,7 @@ class Sensors:
         ]
         self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
         self._noisy = [any(s[name] for name in RANDOM) for s in sensing]
-        self.noise = np.zeros((BLOCK if any(self._noisy) else 1, size), NOISE)
+        self.noise = np.zeros((NOISE_BLOCK if any(self._noisy) else 1, size), NOISE)
         self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]
         for row, seed in enumerate(seeds):
             self.restart(row, seed, 0)
@@ -192,19 +193,19 @@ class Sensors:
         s["fix_lost"], s["fix_outliers"], s["start"] = sensing["fix_lost"], sensing["fix_outliers"], tick
         self._random[row] = random
         self.ring[:, row] = np.zeros(1, SAMPLE)
-        if tick % BLOCK:
-            self._draw(row, tick % BLOCK, tick)
+        if tick % NOISE_BLOCK:
+            self._draw(row, tick % NOISE_BLOCK, tick)
 
     def _draw(self, row: int, first: int, tick: int) -> None:
         """Draws the noise of one robot for the rest of a block, from index `first` on, which belongs to `tick`."""
         if not self._noisy[row]:
             return
         s, random, noise = self.sensors[row], self._random[row], self.noise
-        count = BLOCK - first
+        count = NOISE_BLOCK - first
         for name in ("gyro", "accelerometer"):
             noise[name][first:, row] = random[name].standard_normal((count, noise[name].shape[-1]))
         taken = first + (-(tick - s["start"]) % s["fix_every"]) + s["fix_every"] * np.arange(count)
-        taken = taken[taken < BLOCK]
+        taken = taken[taken < NOISE_BLOCK]
         noise["fix"][taken, row] = random["fix"].standard_normal((len(taken), 3))
         noise["chance"][taken, row] = random["chance"].uniform(size=(len(taken), 4))
 
@@ -220,7 +221,7 @@ class Sensors:
 
     def draw(self, tick: int) -> None:
         """Draws the noise of a block of ticks, if the tick is the first one of it."""
-        if tick % BLOCK == 0:
+        if tick % NOISE_BLOCK == 0:
             for row in range(len(self.sensors)):
                 self._draw(row, 0, tick)
 

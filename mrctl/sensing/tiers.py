@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from mrctl.record import Record, is_whole
-from mrctl.sensing.ekf import KEPT
+from mrctl.sensing.ekf import MAX_STORED
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.drive import (
     NO_LIMIT,
@@ -20,17 +20,17 @@ from mrctl.theory.drive import (
     PwmSteps,
     SteeringServo,
 )
-from mrctl.theory.perturbation import LONGEST_DELAY
+from mrctl.theory.perturbation import MAX_DELAY
 
 Tier = Literal["ideal", "lab", "field"]
 TIERS: tuple[Tier, ...] = ("ideal", "lab", "field")
 EstimatorName = Literal["truth", "odometry", "ekf"]
 Localisation = Literal["fixes", "scan", "particles"]
-IN_FLIGHT = KEPT - 1
+MAX_FIXES_IN_FLIGHT = MAX_STORED - 1
 """Largest number of fixes that have been taken and have not arrived."""
 
 DEGREE = 3.141592653589793 / 180  # rad
-VALUES: dict[str, tuple[float, float, float]] = {
+TIER_VALUES: dict[str, tuple[float, float, float]] = {
     # Lab: 512 pulses on the motor's shaft, four edges each, behind a gear of 43 (Maxon RE25 with an encoder MR 512).
     # Field: Kobuki's 2578.33 ticks a wheel turn (Yujin Robot, Kobuki user guide).
     "encoder_counts": (0, 88_064, 2_578),
@@ -76,7 +76,7 @@ LOCALISED: dict[str, dict[str, float]] = {
 """Values that replace the tier's where fixes come from a lidar: about twice the errors that the tests find."""
 
 Rate = Annotated[float, Field(ge=0, le=10_000)]
-Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
+Latency = Annotated[float, Field(ge=0, le=MAX_DELAY)]
 
 
 class Sensing(Record):
@@ -166,7 +166,7 @@ class Sensing(Record):
             if name == "fix_rate":
                 return self.lidar.rate
             own = LOCALISED[self.localisation].get(name)
-        return VALUES[name][TIERS.index(self.tier)] if own is None else own
+        return TIER_VALUES[name][TIERS.index(self.tier)] if own is None else own
 
     @property
     def source(self) -> EstimatorName:
@@ -238,15 +238,17 @@ class Sensing(Record):
             if self.fix_rate is not None:
                 raise ValueError("sensing.fix_rate: with a lidar the rate of fixes is that of its scans, lidar.rate")
             self.lidar.every(control_period)
-        for name in VALUES:
+        for name in TIER_VALUES:
             if name.endswith(("_rate", "_latency")) or name == "delay":
                 self.periods(name, control_period)
         latency = self.periods("fix_latency", control_period)
         for name in ("encoder_latency", "gyro_latency"):  # a fix from a scan also needs the way since the last one
             if self.localisation != "fixes" and latency < self.periods(name, control_period):
                 raise ValueError(f"sensing.fix_latency: with a lidar it must be at least {name}, {self[name]:g} s")
-        if latency > IN_FLIGHT * self.periods("fix_rate", control_period):
-            raise ValueError(f"sensing.fix_latency: more than {IN_FLIGHT} fixes would be on their way at the same time")
+        if latency > MAX_FIXES_IN_FLIGHT * self.periods("fix_rate", control_period):
+            raise ValueError(
+                f"sensing.fix_latency: more than {MAX_FIXES_IN_FLIGHT} fixes would be on their way at the same time"
+            )
         if latency * control_period >= duration:
             raise ValueError(f"sensing.fix_latency: {self['fix_latency']:g} s, but the run takes {duration:g} s")
 

@@ -28,14 +28,15 @@ from mrctl.record import InputError, printable
 from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
-from mrctl.sweep.plan import CONTROLLER, Sweep
+from mrctl.sweep.plan import CONTROLLER_FIELD, Sweep
 from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work, carry_out, check_address
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
 
-SHOWING = ("checks", "envs", "experiments", "viewer", "cli", "__main__.py")  # rooms on which no stored run depends
+# rooms on which no stored run depends
+SHOWING_ROOMS = ("checks", "envs", "experiments", "viewer", "cli", "__main__.py")
 TOLERANCE = 1e-9  # relative difference within which a repeated run agrees
-ASIDE = "set aside: "
+SET_ASIDE = "set aside: "
 
 
 class Report(NamedTuple):
@@ -95,7 +96,7 @@ def run(
                 finally:
                     pool.close()
             if pending or not store.complete:
-                lost = {job: [_row(sweep, k, ASIDE + why) for k in store.runs(job)] for job, why in aside.items()}
+                lost = {job: [_row(sweep, k, SET_ASIDE + why) for k in store.runs(job)] for job, why in aside.items()}
                 rows = (_table(sweep, lost[job]) if job in lost else store.rows(job) for job in range(store.jobs))
                 store.finish(sweep.columns, rows, complete=not aside)
             failed = _failed([store.table])
@@ -114,7 +115,7 @@ def _absolute(sweep: Sweep) -> Sweep:
         return sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
     axes = list(sweep.axes)
     for place, axis in enumerate(axes):
-        if axis.field == CONTROLLER:
+        if axis.field == CONTROLLER_FIELD:
             own = {value: one.own for value, one in axis.chosen.items() if one.own}
             whole = {value: value.removesuffix(name) + user_files.absolute(name) for value, name in own.items()}
             axes[place] = axis.replace(values=[whole.get(value, value) for value in axis.listed])
@@ -192,7 +193,7 @@ def _try(sweep: Sweep, own: str | None, runs: Sequence[int]) -> None:
 
 
 @cache
-def code_digest(but: tuple[str, ...] = SHOWING) -> str:
+def code_digest(but: tuple[str, ...] = SHOWING_ROOMS) -> str:
     """Returns a digest of all files but those of some rooms; by default of those on which the runs of a sweep depend.
 
     The version of mrctl stays the same between two commits; this digest does not, so that a sweep that was begun before
@@ -390,7 +391,7 @@ def repeat(out: str | Path, run: int) -> Repeat:
     sweep.values(run)  # raises an error if there is no such run
     if (stored := store.row(run)) is None:
         raise InputError(f"run: {run} is not done yet")
-    if stored["failure"].startswith(ASIDE):
+    if stored["failure"].startswith(SET_ASIDE):
         raise InputError(f"run: {run} was {stored['failure']}; there is nothing to compare with")
     (row,), signals = _compute(sweep, [run], store.samples)
     reasons = [one["failure"] or "it finished" for one in (row, stored)]

@@ -29,13 +29,14 @@ from mrctl.scenario import FEEDFORWARDS, Scenario, named
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
-FEWEST, MOST = 4, 64  # runs in a job: a core does 10 runs a second in jobs of 4, 12 of 8, 14 of 16, 15 of 32, 16 of 64
-JOBS = 16  # number of jobs, at least, of a sweep that is large enough: an interrupt loses those under way
-LARGEST = 2**43  # largest size of the signals of all runs in bytes, before compression
-TRIED = 20  # number of first runs, at least one of which must have a valid scenario
-QUIET = 2.0  # s for which values are checked without a progress bar
-WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
-CONTROLLER = "controller"  # the field of an axis whose values say what drives
+# runs in a job: a core does 10 runs a second in jobs of 4, 12 of 8, 14 of 16, 15 of 32, 16 of 64
+MIN_JOB_RUNS, MAX_JOB_RUNS = 4, 64
+MIN_JOBS = 16  # number of jobs, at least, of a sweep that is large enough: an interrupt loses those under way
+MAX_SIGNAL_BYTES = 2**43  # largest size of the signals of all runs in bytes, before compression
+TRIED_RUNS = 20  # number of first runs, at least one of which must have a valid scenario
+QUIET_TIME = 2.0  # s for which values are checked without a progress bar
+SCENARIO_FIELD = "scenario"  # the field of an axis whose values are tables of changes to the scenario
+CONTROLLER_FIELD = "controller"  # the field of an axis whose values say what drives
 
 
 class Chosen(NamedTuple):
@@ -107,7 +108,7 @@ class Axis(Record):
             raise ValueError(f"{self.field}: needs exactly one of {', '.join(kinds)}")
         if not self.listed and (self.paired or self.zip):
             raise ValueError(f"{self.field}: only values and grids can be paired or zipped")
-        if self.field == CONTROLLER and not all(isinstance(value, str) for value in self.values or (None,)):
+        if self.field == CONTROLLER_FIELD and not all(isinstance(value, str) for value in self.values or (None,)):
             raise ValueError('controller: needs values that are names, such as "fel" or "my_file.py:MyController"')
         for low, high in filter(None, (self.uniform, self.loguniform)):
             if not low < high:
@@ -128,7 +129,7 @@ class Axis(Record):
         Raises:
             InputError: A value is no controller.
         """
-        return {value: Chosen.of(value) for value in self.listed} if self.field == CONTROLLER else {}
+        return {value: Chosen.of(value) for value in self.listed} if self.field == CONTROLLER_FIELD else {}
 
     @property
     def middle(self) -> float:
@@ -195,7 +196,7 @@ class Sweep(Record):
         default = Scenario().model_dump(mode="json")
         every = [s.model_dump(mode="json") for s in scenarios]
         changes = [{k: v for k, v in one.items() if k == "seed" or v != default[k]} for one in every]
-        return cls.from_dict({**settings, "axes": [{"field": WHOLE, "values": changes}]}, "sweep")
+        return cls.from_dict({**settings, "axes": [{"field": SCENARIO_FIELD, "values": changes}]}, "sweep")
 
     @model_validator(mode="after")
     def _runnable(self) -> Sweep:
@@ -216,7 +217,7 @@ class Sweep(Record):
             raise ValueError(f"runs: {self.size:,} of them, at most 100,000,000")
         self._check_values()
         kept = self.size * self._longest // self.stride * 8 * len(SIGNALS)
-        if self.record in ("decimated", "full") and kept > LARGEST:
+        if self.record in ("decimated", "full") and kept > MAX_SIGNAL_BYTES:
             raise ValueError(f"record: {self.size:,} runs would keep {kept / 1e12:,.0f} TB of signals; keep metrics")
         return self
 
@@ -228,11 +229,18 @@ class Sweep(Record):
             other = "controller" if self.controller else "hindsight"
             raise ValueError(f"{other}: leave it out beside an axis controller")
         for axis in self.axes:
-            inner = {name for value in axis.listed if axis.field == WHOLE and isinstance(value, dict) for name in value}
+            inner = {
+                name
+                for value in axis.listed
+                if axis.field == SCENARIO_FIELD and isinstance(value, dict)
+                for name in value
+            }
             for name in ("prior", "learner"):
                 if axis.field == name or name in inner:
                     raise ValueError(f"{axis.field}: the axis controller sets {name}; leave it out here")
-        titles = [self._chosen[value].title for axis in self.axes if axis.field == CONTROLLER for value in axis.listed]
+        titles = [
+            self._chosen[value].title for axis in self.axes if axis.field == CONTROLLER_FIELD for value in axis.listed
+        ]
         if doubles := [title for title in titles if titles.count(title) > 1]:
             raise ValueError(f"controller: two values have the name {doubles[0]} in the table")
 
@@ -247,11 +255,11 @@ class Sweep(Record):
             trials += [{self.axes[a].field: self.axes[a].listed[k] for a in group} for k in range(self._length(group))]
         trials += [{axis.field: end} for axis in self.axes for end in axis.uniform or axis.loguniform or ()]
         silent = parent_process() is not None  # a worker reads a sweep that has been checked
-        bar = tqdm(trials, desc="checks the values", unit="value", delay=QUIET, leave=False, disable=silent)
+        bar = tqdm(trials, desc="checks the values", unit="value", delay=QUIET_TIME, leave=False, disable=silent)
         periods = {self._assemble(middle | trial).control_period for trial in bar}
         if len(periods) > 1 and self.record in ("decimated", "full"):
             raise ValueError("control_period: signals share their time axis; keep it, or record metrics")
-        first = range(min(self.size, TRIED))
+        first = range(min(self.size, TRIED_RUNS))
         if not any(self.valid(run) for run in first):
             self.scenario(0)  # raises the error of the first run
 
@@ -275,27 +283,29 @@ class Sweep(Record):
     @cached_property
     def _chosen(self) -> dict[str, Chosen]:
         """What the values of the axis of controllers stand for; nothing where there is no such axis."""
-        return next((axis.chosen for axis in self.axes if axis.field == CONTROLLER), {})
+        return next((axis.chosen for axis in self.axes if axis.field == CONTROLLER_FIELD), {})
 
     def driven_by(self, run: int) -> str | None:
         """Returns the controller of the user that drives one run, or None."""
-        return self._chosen[self.values(run)[CONTROLLER]].own if self._chosen else self.controller
+        return self._chosen[self.values(run)[CONTROLLER_FIELD]].own if self._chosen else self.controller
 
     def base_of(self, run: int) -> Scenario:
         """Returns the base with what the axis of controllers sets in one run, which need not be valid itself."""
-        return self.base.replace(**self._chosen[self.values(run)[CONTROLLER]].fields) if self._chosen else self.base
+        return (
+            self.base.replace(**self._chosen[self.values(run)[CONTROLLER_FIELD]].fields) if self._chosen else self.base
+        )
 
     @property
     def drivers(self) -> dict[str | None, list[int]]:
         """Controllers of the user that drive runs, None for mrctl's own, each with some of the first such runs."""
         if not self._chosen:
-            return {self.controller: list(range(min(self.size, TRIED)))}
+            return {self.controller: list(range(min(self.size, TRIED_RUNS)))}
         found: dict[str | None, list[int]] = {}
-        place = next(number for number, axis in enumerate(self.axes) if axis.field == CONTROLLER)
+        place = next(number for number, axis in enumerate(self.axes) if axis.field == CONTROLLER_FIELD)
         dimension = next(number for number, group in enumerate(self._dimensions) if place in group)
         block = int(np.prod(self._shape[dimension + 1 :], dtype=object))
         for k, one in enumerate(self._chosen.values()):
-            found.setdefault(one.own, []).extend(range(k * block, k * block + min(block, TRIED)))
+            found.setdefault(one.own, []).extend(range(k * block, k * block + min(block, TRIED_RUNS)))
         return found
 
     @property
@@ -306,9 +316,9 @@ class Sweep(Record):
     @cached_property
     def chunk_size(self) -> int:
         """Number of runs in a job; it depends on the file alone, so that the store does for any number of workers."""
-        share = 2 ** (self.size // JOBS).bit_length() // 2  # a power of two, so that runs are compressed together
+        share = 2 ** (self.size // MIN_JOBS).bit_length() // 2  # a power of two, so that runs are compressed together
         largest = CHUNK_BYTES // (8 * len(SIGNALS) * self._longest)
-        return self.chunk or max(1, min(largest, max(FEWEST, min(share, MOST))))
+        return self.chunk or max(1, min(largest, max(MIN_JOB_RUNS, min(share, MAX_JOB_RUNS))))
 
     @property
     def stride(self) -> int:
@@ -333,7 +343,7 @@ class Sweep(Record):
     def _ticks(self, runs: Iterable[int]) -> int:
         """Returns the number of control periods of the longest of some runs."""
         ticks = self.base.ticks
-        if any(axis.field.startswith((WHOLE, "laps", "reference", "control_period")) for axis in self.axes):
+        if any(axis.field.startswith((SCENARIO_FIELD, "laps", "reference", "control_period")) for axis in self.axes):
             ticks = max((scenario.ticks for run in runs if (scenario := self.valid(run))), default=ticks)
         return ticks
 
@@ -377,10 +387,10 @@ class Sweep(Record):
     def _assemble(self, values: dict[str, Any], source: str = "") -> Scenario:
         data = self._plain
         for field, value in values.items():
-            if field == CONTROLLER and self._chosen:
+            if field == CONTROLLER_FIELD and self._chosen:
                 data = data | self._chosen[value].fields
                 continue
-            data = data | value if field == WHOLE and isinstance(value, dict) else _put(data, field, value)
+            data = data | value if field == SCENARIO_FIELD and isinstance(value, dict) else _put(data, field, value)
             inner = isinstance(value, str) and any(other.startswith(f"{field}.") for other in values)
             if isinstance(value, dict) or inner:  # a table, or a name for one, is completed: later axes find its fields
                 data = Scenario.from_dict(data, source).model_dump(mode="json")
@@ -396,7 +406,7 @@ class Sweep(Record):
         listed = {axis.field: axis.listed for axis in self.axes}
         names = ("world", "steering", "robot")
         found = set()
-        for whole in listed.get(WHOLE, ({},)):
+        for whole in listed.get(SCENARIO_FIELD, ({},)):
             worlds, steerings, robots = (listed.get(n, (whole.get(n, getattr(self.base, n)),)) for n in names)
             files = [RobotFile.model_validate(robot) for robot in robots]
             files = [f.model_copy(update={"path": p}) for f in files for p in listed.get("robot.path", (f.path,))]

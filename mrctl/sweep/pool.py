@@ -22,9 +22,9 @@ from typing import Any, NamedTuple, Protocol
 
 from mrctl.record import InputError
 
-PAUSE = 1.0  # s until a killed process has ended on a busy machine
-PATIENCE = 30.0  # s to wait for a scheduler and its first worker
-LATER = "numba", "scipy.optimize", "dask.array"  # imported in a worker's first run; xarray looks for Dask's arrays
+KILL_PAUSE = 1.0  # s until a killed process has ended on a busy machine
+SCHEDULER_PATIENCE = 30.0  # s to wait for a scheduler and its first worker
+PRELOADED = "numba", "scipy.optimize", "dask.array"  # imported in a worker's first run; xarray looks for Dask's arrays
 
 
 class Outcome(NamedTuple):
@@ -115,7 +115,7 @@ class Processes:
         self._work, self._path, self._workers = work, path, workers
         # Workers are forked from a process that has done the imports and has no threads.
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["mrctl.sweep.jobs", *LATER])
+        self._context.set_forkserver_preload(["mrctl.sweep.jobs", *PRELOADED])
         self._idle: list[tuple[BaseProcess, Connection]] = []
         self._busy: dict[Connection, tuple[BaseProcess, int]] = {}
 
@@ -144,7 +144,7 @@ class Processes:
                 process.start()
                 return process, ours
             ours.close()
-            time.sleep(PAUSE)
+            time.sleep(KILL_PAUSE)
         raise InputError("workers: no process can be started; what was done is kept")
 
     def wait(self) -> list[Outcome]:
@@ -245,11 +245,11 @@ class Cluster:
         self._ended: SimpleQueue[Any] = SimpleQueue()
         self._thread = ThreadPoolExecutor(1)
         try:
-            self._client = distributed.Client(address, timeout=PATIENCE, set_as_default=False)
+            self._client = distributed.Client(address, timeout=SCHEDULER_PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(f"scheduler: {address}: {' '.join(str(error).split()) or 'no answer'}") from None
         try:
-            self._client.wait_for_workers(1, timeout=PATIENCE)
+            self._client.wait_for_workers(1, timeout=SCHEDULER_PATIENCE)
         except TimeoutError:
             self.close()
             raise InputError(f"scheduler: {address}: has no workers") from None

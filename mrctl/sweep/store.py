@@ -56,17 +56,17 @@ from mrctl.results.dataset import (
     reading_chunks,
 )
 from mrctl.results.metrics import METRICS
-from mrctl.scenario import LONGEST
+from mrctl.scenario import MAX_TICKS
 from mrctl.sweep.signals import DIMENSIONS, lazily
 
-LARGEST = 2**28  # largest size of sweep.json in bytes
+MAX_PLAN_BYTES = 2**28  # largest size of sweep.json in bytes
 KIND, FORMAT = "mrctl sweep", 3
 ROUNDING = 1e-12
 """Largest relative difference between a number of a sweep and that of its store that counts as rounding; the store
 keeps its own number. Drawn references are computed with functions that another processor rounds differently."""
 CHECKSUM = "checksum"  # key in sweep.json: the checksum of all others
 ROW_GROUP = 16384  # number of rows of the table that are written at once
-INNER = 16  # runs that are compressed together, signal by signal
+INNER_RUNS = 16  # runs that are compressed together, signal by signal
 COMPLETE = b"complete"  # key in the metadata of the table; b"1" if it holds every job
 
 
@@ -90,7 +90,7 @@ class _Manifest(Record):
     models: dict[str, str]
     size: Annotated[int, Field(ge=0, le=100_000_000)]
     chunk: Annotated[int, Field(ge=1, le=100_000_000)]
-    samples: Annotated[int, Field(ge=0, le=LONGEST)]
+    samples: Annotated[int, Field(ge=0, le=MAX_TICKS)]
     stride: Annotated[int, Field(ge=1)]
     control_period: Annotated[float, Field(gt=0)]
     signals: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ class Store:
         """
         self.path = Path(path).absolute()
         try:
-            self.manifest: dict[str, Any] = json.loads(read_file(self.path / "sweep.json", LARGEST))
+            self.manifest: dict[str, Any] = json.loads(read_file(self.path / "sweep.json", MAX_PLAN_BYTES))
             found, self.writer = self.manifest[KIND], str(self.manifest["versions"]["mrctl"])
         except (ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"{path}: not a sweep's store") from None
@@ -362,7 +362,7 @@ class Store:
         return (
             (self.size, self.samples, signals),
             (chunk, self.samples, signals),
-            (math.gcd(chunk, INNER), self.samples, 1),
+            (math.gcd(chunk, INNER_RUNS), self.samples, 1),
         )
 
     def _check_size(self, tables: Iterable[Path], samples: int = 0) -> None:

@@ -12,7 +12,7 @@ from mrctl.record import InputError
 from mrctl.theory.clearance import point_to_polygon
 from mrctl.theory.obstacles import Obstacles, Outlines
 
-MOST_CELLS = 20_000_000
+MAX_CELLS = 20_000_000
 MAP_CELL, MAP_MARGIN = 0.05, 1.0  # m, side of a cell of the field of a map, which extends so far beyond its obstacles
 
 
@@ -44,8 +44,8 @@ def check_size(rows: int, columns: int, name: str) -> None:
     Raises:
         InputError: It has more; the message begins with the name.
     """
-    if rows * columns > MOST_CELLS:
-        raise InputError(f"{name}: {columns} by {rows} cells are more than {MOST_CELLS:,}")
+    if rows * columns > MAX_CELLS:
+        raise InputError(f"{name}: {columns} by {rows} cells are more than {MAX_CELLS:,}")
 
 
 def occupancy(outlines: Outlines, low: Array, high: Array, resolution: float) -> Grid:
@@ -106,7 +106,7 @@ def field_of(outlines: Outlines, low: Array, high: Array, resolution: float) -> 
 def map_area(known: Obstacles) -> tuple[Array, Array, float]:
     """Returns the rectangle of the field of a map, lower left and upper right corner, `(2,)`, and its cell, in m."""
     low, high = (corner + side * MAP_MARGIN for corner, side in zip(known.bounds, (-1, 1), strict=True))
-    return low, high, max(MAP_CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
+    return low, high, max(MAP_CELL, float(np.sqrt(np.prod(high - low) / MAX_CELLS)) * 1.01)
 
 
 def near_field(outlines: Outlines, low: Array, high: Array, resolution: float, reach: float) -> Field:

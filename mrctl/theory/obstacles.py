@@ -17,9 +17,9 @@ from mrctl.kernel import Array, kernel
 from mrctl.record import InputError, Record
 from mrctl.theory.references import Reference
 
-MOST = 20_000  # obstacles in one world; a map with more has a finer resolution than a robot needs
-FLAT = 0.02  # m, height up to which a solid is ground
-OVERHEAD = 1.0  # m, height from which on a solid hangs over robots, as the lintel of a door
+MAX_OBSTACLES = 20_000  # obstacles in one world; a map with more has a finer resolution than a robot needs
+GROUND_HEIGHT = 0.02  # m, height up to which a solid is ground
+OVERHEAD_HEIGHT = 1.0  # m, height from which on a solid hangs over robots, as the lintel of a door
 
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Size = Annotated[float, Field(ge=1e-3, le=1e4)]
@@ -104,7 +104,7 @@ Obstacle = Annotated[Disc | Box | Polygon, Field(discriminator="kind")]
 class Obstacles(Record):
     """The obstacles of a world; a scenario may give the path of a TOML file in place of its content."""
 
-    shapes: Annotated[tuple[Obstacle, ...], Field(max_length=MOST)] = ()
+    shapes: Annotated[tuple[Obstacle, ...], Field(max_length=MAX_OBSTACLES)] = ()
     """Obstacles, each with its `kind`: disc, box or polygon."""
 
     @model_validator(mode="before")

@@ -23,7 +23,7 @@ from mrctl.theory.drive import (
     SteeringServo,
 )
 
-LONGEST_DELAY = 0.5
+MAX_DELAY = 0.5
 """Longest delay or latency in s; those of sensing and perturbation add, so that a command may take twice as long."""
 
 Factor = Annotated[float, Field(ge=0.05, le=20)]
@@ -93,7 +93,7 @@ class Perturbation(Record):
     """Further factor on the friction of the rear left tyre."""
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
-    control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
+    control_delay: Annotated[float, Field(ge=0, le=MAX_DELAY)] = 0.0
     """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""
 
     @model_validator(mode="before")
@@ -109,14 +109,14 @@ class Perturbation(Record):
     def drawn(self, random: np.random.Generator) -> Perturbation:
         """Returns the perturbation of one robot on one day, with its unknown differences drawn at random.
 
-        Each factor in `UNKNOWN` is multiplied by a uniform draw from 1 ± w; to the slope a uniform draw from
-        ± `UNKNOWN_SLOPE` is added.
+        Each factor in `REPLICATE_HALF_WIDTHS` is multiplied by a uniform draw from 1 ± w; to the slope a uniform draw
+        from ± `REPLICATE_SLOPE` is added.
 
         Args:
             random: Source of random numbers; each draw takes the same number of values from it.
         """
-        changed = {name: getattr(self, name) * (1 + random.uniform(-w, w)) for name, w in UNKNOWN.items()}
-        changed["slope"] = self.slope + random.uniform(-UNKNOWN_SLOPE, UNKNOWN_SLOPE)
+        changed = {name: getattr(self, name) * (1 + random.uniform(-w, w)) for name, w in REPLICATE_HALF_WIDTHS.items()}
+        changed["slope"] = self.slope + random.uniform(-REPLICATE_SLOPE, REPLICATE_SLOPE)
         return self.replace(**changed)
 
     def of_driver(self, driver: Driver) -> Driver:
@@ -135,7 +135,7 @@ class Perturbation(Record):
         return servo.model_copy(update=changed)
 
 
-UNKNOWN = {
+REPLICATE_HALF_WIDTHS = {
     "mass_factor": 0.03,
     "drive_friction_factor": 0.2,
     "resistance_factor": 0.05,
@@ -145,7 +145,7 @@ UNKNOWN = {
     "right_radius_factor": 0.005,
 }
 """Half widths of the factors in which two robots of one kind differ (chosen: tolerances of bought parts)."""
-UNKNOWN_SLOPE = 0.01  # rad, 0.6°: a floor that passes for level
+REPLICATE_SLOPE = 0.01  # rad, 0.6°: a floor that passes for level
 
 PERTURBATIONS: dict[str, Perturbation] = {
     "nominal": Perturbation(),

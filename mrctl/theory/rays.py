@@ -9,7 +9,7 @@ import numpy as np
 from mrctl.kernel import Array, kernel
 from mrctl.theory.obstacles import Outlines
 
-SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it, so that none slips through
+EDGE_SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it, so that none slips through
 
 
 class Scan(NamedTuple):
@@ -73,9 +73,9 @@ def cast(pose: Array, first: float, step: float, reach: float, outlines: Outline
         towards -= 2 * np.pi * np.floor(towards / (2 * np.pi))
         for lap in range(2):  # an interval that contains the direction of the first beam also begins a turn before it
             start = towards - 2 * np.pi * lap
-            for beam in range(max(0, int(np.ceil((start - SLACK) / step))), n):
+            for beam in range(max(0, int(np.ceil((start - EDGE_SLACK) / step))), n):
                 angle = beam * step
-                if angle > start + 2 * half + SLACK:
+                if angle > start + 2 * half + EDGE_SLACK:
                     break
                 along = dx * np.cos(turn + angle) + dy * np.sin(turn + angle)
                 across = dx * np.sin(turn + angle) - dy * np.cos(turn + angle)
@@ -100,9 +100,9 @@ def cast(pose: Array, first: float, step: float, reach: float, outlines: Outline
             towards -= 2 * np.pi * np.floor(towards / (2 * np.pi))
             for lap in range(2):
                 start = towards - 2 * np.pi * lap
-                for beam in range(max(0, int(np.ceil((start - SLACK) / step))), n):
+                for beam in range(max(0, int(np.ceil((start - EDGE_SLACK) / step))), n):
                     angle = beam * step
-                    if angle > start + width + SLACK:
+                    if angle > start + width + EDGE_SLACK:
                         break
                     across = np.cos(turn + angle) * ey - np.sin(turn + angle) * ex
                     if across != 0.0:

@@ -26,11 +26,11 @@ from mrctl.kernel import Array
 from mrctl.record import InputError, Record
 from mrctl.theory.robot import GRAVITY, Robot
 from mrctl.theory.spline import Plane, Spline, plane, spline
-from mrctl.theory.timing import RESERVE, Limits, SmoothLaw, sample_path, smooth
+from mrctl.theory.timing import LIMIT_SHARE, Limits, SmoothLaw, sample_path, smooth
 
 Length = Annotated[float, Field(ge=1e-3, le=1000)]
-SLOWEST = 0.01  # m/s, of a reference with a constant or a largest speed
-Speed = Annotated[float, Field(ge=SLOWEST, le=20)]
+MIN_SPEED = 0.01  # m/s, of a reference with a constant or a largest speed
+Speed = Annotated[float, Field(ge=MIN_SPEED, le=20)]
 Duration = Annotated[float, Field(ge=0.1, le=3600)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 EndCurvature = Annotated[float, Field(ge=-20, le=20)]
@@ -271,7 +271,7 @@ class StopAndGo(Record):
         return along_path(start * self.distance + x + 0j, 0, 0, 0, v, a)
 
 
-KINK = 0.15  # rad, largest change of the heading at a cusp
+MAX_CUSP_KINK = 0.15  # rad, largest change of the heading at a cusp
 _LOOP = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.8), (2.5, 2.2), (1.0, 1.6), (-0.8, 2.0), (-1.2, 0.6))
 
 
@@ -360,8 +360,8 @@ class Waypoints(Record):
             part._check_gaps(1e-9, first, "cusp_curvatures" if k < len(parts) - 1 else "end_curvature")
             part._check_turns()
             ends = part._path.heading[[0, -1]] + np.pi * back
-            if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > KINK:
-                raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at a cusp")
+            if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > MAX_CUSP_KINK:
+                raise ValueError(f"cusps: the curve turns by more than {MAX_CUSP_KINK:g} rad at a cusp")
             heading = ends[1]
         return self
 
@@ -450,7 +450,7 @@ def _time_law(
 
 
 def random_spline(
-    random: np.random.Generator, robot: Robot, speed: float = 0.95, reserve: float = RESERVE
+    random: np.random.Generator, robot: Robot, speed: float = 0.95, reserve: float = LIMIT_SHARE
 ) -> Waypoints:
     """A random closed spline around the origin, driven at changing speed under the limits of a robot.
 

@@ -34,12 +34,12 @@ from mrctl.record import InputError, Record
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import GRAVITY, Robot
 
-RESERVE = 0.9
+LIMIT_SHARE = 0.9
 """Share of the robot's limits that a reference may use; the rest is for the feedback. Chosen."""
 
-PER_TURN = 40  # least number of intervals for each rad of a curve; chosen
-MOST_INTERVALS = 20_000
-LAPS = 1000  # largest number of passes, until the speed at the end of a closed path is that at its start
+INTERVALS_PER_RADIAN = 40  # least number of intervals for each rad of a curve; chosen
+MAX_INTERVALS = 20_000
+MAX_PASSES = 1000  # largest number of passes, until the speed at the end of a closed path is that at its start
 
 Limit = Annotated[float, Field(ge=1e-3, le=1e4)]
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -73,7 +73,7 @@ class Limits(Record):
         return self
 
     @classmethod
-    def of(cls, robot: Robot, reserve: float = RESERVE) -> Limits:
+    def of(cls, robot: Robot, reserve: float = LIMIT_SHARE) -> Limits:
         """Returns the limits of a robot.
 
         Args:
@@ -132,14 +132,14 @@ def sample_path(shape: Shape, s: Array, closed: bool, limits: Limits, speed: flo
         # From rest to the full speed, or to the middle of the path, the intervals take equal times.
         distance = min(speed**2 / (2 * a), length / 2)
         times = np.ceil(np.sqrt(2 * distance / a) * max(8 / limits.smoothing, 64 * a / speed))
-        near = distance * np.linspace(0, 1, int(min(times, MOST_INTERVALS)) + 1) ** 2
+        near = distance * np.linspace(0, 1, int(min(times, MAX_INTERVALS)) + 1) ** 2
         s = np.union1d(s, np.concatenate([near, length - near]))
         slow = times * (1 + np.sqrt(np.minimum(s / distance, 1)) - np.sqrt(np.minimum((length - s) / distance, 1)))
     k, dk = shape(s)
     turning = np.maximum(np.abs(k), np.sqrt(np.abs(dk)))  # inverse of the length over which the path turns, 1/m
-    density = np.maximum(1 / step, PER_TURN * turning)
+    density = np.maximum(1 / step, INTERVALS_PER_RADIAN * turning)
     count = np.append(0, np.cumsum(np.diff(s) * (density[1:] + density[:-1]) / 2)) + slow
-    intervals = int(np.clip(np.ceil(count[-1]), 2, MOST_INTERVALS))
+    intervals = int(np.clip(np.ceil(count[-1]), 2, MAX_INTERVALS))
     ends = np.interp(np.linspace(0, count[-1], intervals + 1), count, s)
     if 0 < (held := start * limits.smoothing / 2) < ends[-2]:
         ends[max(1, np.abs(ends - held).argmin())] = held
@@ -501,7 +501,7 @@ def _solved(path: Path, rows: Array, caps: Array, start: float, kept: float) -> 
         raise InputError("limits.voltage: too low to overcome the friction of the drives")
     step, largest, x = np.diff(path.s[::2]), np.empty(len(caps)), np.empty(len(caps))
     end = caps[-1] if path.closed else 0.0
-    for _ in range(LAPS):  # of a closed path, until a lap ends as it starts
+    for _ in range(MAX_PASSES):  # of a closed path, until a lap ends as it starts
         controllable(rows, caps, step, end, largest)
         if not path.closed or largest[0] >= end:
             break
@@ -514,7 +514,7 @@ def _solved(path: Path, rows: Array, caps: Array, start: float, kept: float) -> 
         greedy(rows, largest, step, first, held, x)
         return TimeLaw(path, x)
     first = end
-    for _ in range(LAPS):
+    for _ in range(MAX_PASSES):
         greedy(rows, largest, step, first, 0, x)
         if x[-1] >= first:
             break

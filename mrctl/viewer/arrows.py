@@ -12,14 +12,14 @@ import numpy as np
 import viser
 
 from mrctl.kernel import Array
-from mrctl.physics.contacts import NOTHING, Contacts
+from mrctl.physics.contacts import NO_CONTACTS, Contacts
 from mrctl.theory.robot import GRAVITY, Robot
 from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour
 from mrctl.viewer.robots import Robots, name_of
 
-HARD = 3.0  # N/kg, a push whose arrow is as long as the robot
-SLIDING = 0.1  # share of the robot's largest speed, a slip whose arrow is as long as the robot
-LEAST_ARROW = 0.03  # robot lengths; shorter ones are not drawn
+PUSH_OF_LENGTH = 3.0  # N/kg, a push whose arrow is as long as the robot
+SLIP_OF_LENGTH = 0.1  # share of the robot's largest speed, a slip whose arrow is as long as the robot
+MIN_ARROW = 0.03  # robot lengths; shorter ones are not drawn
 FORCE_COLOUR: Colour = (37, 99, 235)
 SLIP_COLOUR: Colour = (220, 38, 38)
 
@@ -44,7 +44,7 @@ class Arrows:
             if arrow is not None:
                 arrow.visible = False
             return
-        way = np.append(self._robots.length * force / (HARD * self._mass), 0.0)
+        way = np.append(self._robots.length * force / (PUSH_OF_LENGTH * self._mass), 0.0)
         if arrow is None:
             arrow = self._forces[row] = self._draw_arrows(f"/world/force/{row}", EVENT_COLOUR, 0.03)
         arrow.points = np.stack([np.zeros(3), way])[None]
@@ -63,13 +63,13 @@ class Arrows:
                 named = ("force", FORCE_COLOUR), ("slip", SLIP_COLOUR)
                 self._touches.append([self._draw_arrows(f"{name}/{kind}", colour, 0.02) for kind, colour in named])
         for row, arrows in enumerate(self._touches):
-            touch = touches[row] if row < len(touches) else NOTHING
+            touch = touches[row] if row < len(touches) else NO_CONTACTS
             turn = np.empty(9)
             mujoco.mju_quat2Mat(turn, self._robots.quaternions[row])
             places = (touch.places - self._robots.positions[row]) @ turn.reshape(3, 3)
-            lengths = touch.forces / (self._mass * GRAVITY), touch.slips / (SLIDING * self._max_speed)
+            lengths = touch.forces / (self._mass * GRAVITY), touch.slips / (SLIP_OF_LENGTH * self._max_speed)
             for drawn, ways in zip(arrows, lengths, strict=True):
-                seen = np.linalg.norm(ways, axis=1) > LEAST_ARROW
+                seen = np.linalg.norm(ways, axis=1) > MIN_ARROW
                 drawn.visible = bool(seen.any())
                 if drawn.visible:
                     start = places[seen]

@@ -8,14 +8,14 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from mrctl.kernel import Array
-from mrctl.physics.obstacles import HEIGHT
+from mrctl.physics.obstacles import WALL_HEIGHT
 from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.viewer.shapes import sides
 
 OVERVIEW, TOP = np.array([0.0, -0.7, 0.7]), np.array([0.0, -0.01, 1.0])  # directions to cameras; no camera looks down
-LEAST_VIEW = 1.2  # m, least width of the view
+MIN_VIEW = 1.2  # m, least width of the view
 COURSE_TIMES = 9  # at which obstacles that move are to be seen in an overview
-FULL = 0.92  # share of width or height of a picture that is filled
+FILLED_SHARE = 0.92  # share of width or height of a picture that is filled
 HALVINGS = 40  # of intervals of slopes
 
 
@@ -43,7 +43,7 @@ def fitted(points: Array, side: Array, fov: float, aspect: float) -> tuple[Array
         """
         return np.stack([(sign * across - slopes * depth).max(axis=0) for sign in (1, -1)])
 
-    largest = FULL * np.tan(fov / 2) * np.array([aspect, 1.0])
+    largest = FILLED_SHARE * np.tan(fov / 2) * np.array([aspect, 1.0])
     back = (-extents(largest).sum(axis=0) / (2 * largest)).min()
     depth -= back
     low, high = np.zeros(2), largest
@@ -70,9 +70,9 @@ def to_see(lines: Array, duration: float, reach: float, top: float, obstacles: O
         Corners of a convex body in m, `(k, 3)`: a camera that sees these sees all.
     """
     low, high = lines.min(axis=0), lines.max(axis=0)
-    size = max(LEAST_VIEW, *(high - low)[:2])
+    size = max(MIN_VIEW, *(high - low)[:2])
     found = [lines + np.array(corner) for corner in itertools.product((-reach, reach), (-reach, reach), (0.0, top))]
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * LEAST_VIEW / 2
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * MIN_VIEW / 2
     least = (low + high) / 2 + np.column_stack([square, np.zeros(4)])
     moving = Surroundings(Obstacles(shapes=obstacles.moving))
     outlines = [moving.at(time) for time in np.linspace(0, duration, COURSE_TIMES) if moving.courses]
@@ -80,6 +80,6 @@ def to_see(lines: Array, duration: float, reach: float, top: float, obstacles: O
     left, right = low[:2] - size, high[:2] + size  # what is farther away would make all else too small
     around = (segments.max(axis=1) >= left) & (segments.min(axis=1) <= right)
     near = segments[around.all(axis=1)].reshape(-1, 2).clip(left, right)
-    found += [np.column_stack([near, np.full(len(near), z)]) for z in (low[2], HEIGHT)]
+    found += [np.column_stack([near, np.full(len(near), z)]) for z in (low[2], WALL_HEIGHT)]
     points = np.concatenate([*found, least])
     return points[ConvexHull(points).vertices]

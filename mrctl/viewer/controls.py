@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic.fields import FieldInfo
 
 from mrctl.record import Record
-from mrctl.sensing.tiers import START, VALUES, Sensing
+from mrctl.sensing.tiers import START, TIER_VALUES, Sensing
 from mrctl.theory.robot import Robot
 from mrctl.viewer.slider_ranges import Interval, slider_range
 
@@ -20,10 +20,10 @@ OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
 SENSORS = {"encoders": "encoder", "gyro": "gyro", "accelerometer": "accelerometer", "posture fixes": "fix"}
 DRIVER = ("dead_zone", "pwm_steps", "current_limit", "battery_resistance")
-MAPPED = ("localisation", "lidar", "start_unknown")  # fields without an input, as they need obstacles, in a file
-PLANNED = ("start_speed", "start_curvature", "end_curvature", "cusp_curvatures")  # nor have these, which plans set
-ANEW, ANEW_HINT = " ↻", "A change begins another run."  # behind the label of what cannot change during a run
-SEED = ("seed",)  # a number that no slider suits
+MAP_FIELDS = ("localisation", "lidar", "start_unknown")  # fields without an input, as they need obstacles, in a file
+PLAN_FIELDS = ("start_speed", "start_curvature", "end_curvature", "cusp_curvatures")  # nor have these, which plans set
+NEW_RUN_MARK, NEW_RUN_HINT = " ↻", "A change begins another run."  # behind the label of what cannot change during a run
+SEED_FIELDS = ("seed",)  # a number that no slider suits
 STEERING = ("steering_offset", "steering_backlash")
 # Fields of large records in groups, by the name of the field that holds the record. The first group of a perturbation
 # is open; fields without a group stand above the groups.
@@ -46,7 +46,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         ),
     },
     "sensing": {
-        group: tuple(name for name in VALUES if name.startswith(f"{sensor}_")) for group, sensor in SENSORS.items()
+        group: tuple(name for name in TIER_VALUES if name.startswith(f"{sensor}_")) for group, sensor in SENSORS.items()
     }
     | {"driver and battery": ("delay", *DRIVER), "steering": STEERING},
 }
@@ -101,7 +101,7 @@ class Controls:
         groups = GROUPS.get(path[-1], {}) if path else {}
         grouped = [name for names in groups.values() for name in names]
         for name, field in type(record).model_fields.items():
-            if name not in (*grouped, *MAPPED, *PLANNED) and (only is None or name in only):
+            if name not in (*grouped, *MAP_FIELDS, *PLAN_FIELDS) and (only is None or name in only):
                 self._add(self._shown(record, (*path, name)), field, (*path, name))
         for group, names in groups.items():
             with self._gui.add_folder(group, expand_by_default=group == "mass and payload"):
@@ -141,7 +141,7 @@ class Controls:
             self._limits[path] = low, high
             # Whole numbers are floats too: viser accepts an int of any size from a page, and then fails to pack it for
             # the other pages.
-            if kind is field and path != SEED and (ends := slider_range(path, field, (low, high), self._robot)):
+            if kind is field and path != SEED_FIELDS and (ends := slider_range(path, field, (low, high), self._robot)):
                 self._sliders[path] = field, ends
                 first, last = min(ends[0], value), max(ends[1], value)
                 step = step if kind.annotation is int else _step(last - first, value)
@@ -172,7 +172,7 @@ class Controls:
 
     def _label(self, path: tuple[str, ...]) -> str:
         """Returns the name of a field in words, with a mark if its change begins another run."""
-        return _words(path) if path[0] in self._changeable else _words(path) + ANEW
+        return _words(path) if path[0] in self._changeable else _words(path) + NEW_RUN_MARK
 
     def _hint(self, path: tuple[str, ...], field: FieldInfo) -> str:
         """Returns the text that a page shows when the mouse is over an input: its description and its limits.
@@ -185,7 +185,7 @@ class Controls:
             words = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
             limits = ", ".join(f"{words[kind]} {bounds[kind]:.12g}" for kind in words if kind in bounds)
             known = f"{known} {limits.capitalize()}.".lstrip()
-        return known if path[0] in self._changeable else f"{known} {ANEW_HINT}".lstrip()
+        return known if path[0] in self._changeable else f"{known} {NEW_RUN_HINT}".lstrip()
 
     def _listen(self, path: tuple[str, ...], handle: Any, whole: bool = False) -> None:  # noqa: ANN401
         """Reports the values of an input, rounded if the field is a whole number."""
@@ -295,7 +295,7 @@ def _scale(path: tuple[str, ...], value: float) -> float:
     if path[0] != "sensing":
         return value
     name = START.get(path[-1], path[-1])
-    return min((v for v in VALUES[name] if v > 0), default=1.0)
+    return min((v for v in TIER_VALUES[name] if v > 0), default=1.0)
 
 
 def _kinds(field: FieldInfo) -> dict[str, type[Record]]:

@@ -10,8 +10,8 @@ import xarray as xr
 from mrctl.record import InputError
 from mrctl.results.metrics import as_runs
 
-HEIGHT = 480  # pixels
-LONGEST = 60.0  # s, longest replay; the page of a minute of two robots takes a few megabytes
+FRAME_HEIGHT = 480  # pixels
+MAX_SECONDS = 60.0  # s, longest replay; the page of a minute of two robots takes a few megabytes
 
 
 class Replay:
@@ -28,7 +28,7 @@ class Replay:
         self.page = page
 
     def _repr_html_(self) -> str:
-        style = f"width: 100%; height: {HEIGHT}px; border: 1px solid #e5e7eb"
+        style = f"width: 100%; height: {FRAME_HEIGHT}px; border: 1px solid #e5e7eb"
         start = '<iframe class="mrctl-replay" title="replay" loading="lazy"'  # loads when a reader scrolls to it
         return f'{start} style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
 
@@ -54,7 +54,7 @@ def replay(*results: xr.Dataset) -> Replay:
     for recording in recordings:
         if not np.isfinite(recording.log["x"][0]):
             raise InputError(f"results: {recording.label} had failed before {recording.start:g} s")
-        if recording.duration > LONGEST:
+        if recording.duration > MAX_SECONDS:
             raise InputError(
                 f"results: {recording.duration:g} s are too long for a page; select some with .sel(time=…)"
             )

@@ -12,7 +12,7 @@ import viser
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Pose
-from mrctl.viewer.arrows import HARD
+from mrctl.viewer.arrows import PUSH_OF_LENGTH
 from mrctl.viewer.page import Page, block
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.session import Session
@@ -147,7 +147,7 @@ class Hands:
     def _drag_push(self, phase: str, start: Array, end: Array) -> None:  # noqa: ARG002 (the robot may have moved)
         """Pushes all robots at the end of a drag from the first one; before, the page draws an arrow."""
         robot = self._session.robot
-        fx, fy = HARD * robot.mass * (end - self._scene.robots.positions[0, :2]) / self._scene.length
+        fx, fy = PUSH_OF_LENGTH * robot.mass * (end - self._scene.robots.positions[0, :2]) / self._scene.length
         self.pull = None if phase == "end" else (float(fx), float(fy))
         if phase == "end":
             self._apply(push=(*rounded(fx, fy), 0.0))

@@ -22,17 +22,17 @@ from mrctl.loop.timeline import CHANGEABLE, begun, ends, followed, state
 from mrctl.navigation.planning import Avoid
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
-from mrctl.results.controllers import CONTROLLER, title_of
+from mrctl.results.controllers import CONTROLLER_FIELDS, title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot, RobotFile
-from mrctl.viewer.arrows import HARD
-from mrctl.viewer.controls import ANEW, WORLDS, Controls
+from mrctl.viewer.arrows import PUSH_OF_LENGTH
+from mrctl.viewer.controls import NEW_RUN_MARK, WORLDS, Controls
 from mrctl.viewer.deviation import drawn
-from mrctl.viewer.embed import LONGEST
+from mrctl.viewer.embed import MAX_SECONDS
 from mrctl.viewer.hands import Hands, rounded
 from mrctl.viewer.looks import MAX_MARKED, looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
@@ -42,14 +42,14 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import HOUR, Session, changed, pushed
+from mrctl.viewer.session import MAX_TIME, Session, changed, pushed
 from mrctl.viewer.stories import STORIES
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 200  # about the largest number of samples in a curve; a chart is some 300 pixels wide
 TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each of which may take half a second
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
-REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
+SLIDER_REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
 TOUCH_HINT = "Blue: forces on the wheels, a robot's length for its weight. Red: slip, for a tenth of its top speed."
 FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the one that it chooses."
@@ -62,12 +62,12 @@ from mrctl.navigation.avoiders import avoiding
 '''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
-NOTHING = np.zeros((0, 2, 2))
-PLANNED = ("world", "steering", "reference")  # fields on which a plan depends
-KEPT = ("prior", "learner", "seed")  # fields that stay when the robot changes, as the tier of the sensors does
+NO_ARCS = np.zeros((0, 2, 2))
+PLANNED_FIELDS = ("world", "steering", "reference")  # fields on which a plan depends
+KEPT_FIELDS = ("prior", "learner", "seed")  # fields that stay when the robot changes, as the tier of the sensors does
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
-NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
-HIDDEN = (
+NEW_RUN_FIELDS = ("world", "steering", "sensing", "reference", "seed", "prefilter")
+HIDDEN_INPUTS = (
     "name",
     "laps",
     "events",
@@ -90,7 +90,7 @@ def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
     """
     mass, half_track = robot.mass, robot.half_track
     load = rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
-    push, spin = rounded(HARD * mass, 4 * mass * half_track)  # N and N·m
+    push, spin = rounded(PUSH_OF_LENGTH * mass, 4 * mass * half_track)  # N and N·m
     return {
         "Payload": {
             "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
@@ -121,7 +121,7 @@ class Live(Page):
         """
         super().__init__(server)
         self.session = Session(scenarios, avoid)
-        self._searched = NOTHING if searched is None else searched
+        self._searched = NO_ARCS if searched is None else searched
         self.factor = 0.0  # ratio of simulated to wall time in the last second
         self._back: int | None = None  # tick that is shown, while a visitor looks back
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
@@ -142,7 +142,7 @@ class Live(Page):
     def _build(self) -> None:
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         self._plots = Plots(gui, self.curves)
-        self._plots.time.max = HOUR
+        self._plots.time.max = MAX_TIME
         self.on(self._plots.time, self._look_back)
         with tabs.add_tab("Drive"):
             self._add_drive(gui)
@@ -198,9 +198,11 @@ class Live(Page):
         self.add_key("P", "Draw a way", self._hands.draw_way)
 
     def _add_controllers(self, gui: viser.GuiApi, first: Scenario) -> None:
-        gui.add_html(block("anew", f"A change of an input with{ANEW} begins another run; the others act at once."))
-        self._controls.add(first, only=CONTROLLER)
-        with gui.add_folder("compare with" + ANEW):
+        gui.add_html(
+            block("anew", f"A change of an input with{NEW_RUN_MARK} begins another run; the others act at once.")
+        )
+        self._controls.add(first, only=CONTROLLER_FIELDS)
+        with gui.add_folder("compare with" + NEW_RUN_MARK):
             self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
                 name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
             }
@@ -209,17 +211,17 @@ class Live(Page):
         self._learning = gui.add_checkbox("learning", True)
         self.on(self._learning, lambda on: self._apply_event(learning=on))
         self._gains = gui.add_html("")
-        elsewhere = *HIDDEN, *NEW_RUN, "perturbation", *CONTROLLER
+        elsewhere = *HIDDEN_INPUTS, *NEW_RUN_FIELDS, "perturbation", *CONTROLLER_FIELDS
         self._controls.add(first, only=[name for name in Scenario.model_fields if name not in elsewhere])
 
     def _add_run(self, gui: viser.GuiApi, first: Scenario) -> None:
         self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
-        gui.add_html(block("all-anew", f"A change of any of these inputs begins another run ({ANEW.strip()})."))
+        gui.add_html(block("all-anew", f"A change of any of these inputs begins another run ({NEW_RUN_MARK.strip()})."))
         hint = "Another robot begins another run, with the steering and a reference that suit it."
         names, now = tuple(self._robots), first.robot.path
-        self._robot = gui.add_dropdown("robot" + ANEW, names, initial_value=now, hint=hint)
+        self._robot = gui.add_dropdown("robot" + NEW_RUN_MARK, names, initial_value=now, hint=hint)
         self.on(self._robot, self._choose_robot)
-        self._controls.add(first, only=NEW_RUN)
+        self._controls.add(first, only=NEW_RUN_FIELDS)
 
     def _show_session(self) -> None:
         """Shows the robots of a new session in the scene and in the plots."""
@@ -244,7 +246,9 @@ class Live(Page):
         self._scene.show_reference(first)
         self._scene.forget_trails()
         self._hands.begin(self._scene, session)
-        self._controls.hide([*(() if session.tunable else ["kanayama"]), *(PLANNED if session.avoid != "none" else ())])
+        self._controls.hide(
+            [*(() if session.tunable else ["kanayama"]), *(PLANNED_FIELDS if session.avoid != "none" else ())]
+        )
         self._fan.visible = session.avoid in ("window", "mppi")
         self._show_search()
         for name, ghost in self._ghosts.items():
@@ -324,7 +328,7 @@ class Live(Page):
 
     def _show_search(self) -> None:
         self._tree.visible = len(self._searched) > 0
-        self._scene.navigation.show_search(self._searched if self._tree.value else NOTHING)
+        self._scene.navigation.show_search(self._searched if self._tree.value else NO_ARCS)
 
     @override
     def choose_speed(self, name: str) -> None:
@@ -350,7 +354,7 @@ class Live(Page):
     def _note_input(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         """Notes the value of an input; while a slider is dragged, only the value counts at which it rests."""
         self._changed_inputs[path] = value
-        self._rested = time.monotonic() + (REST if isinstance(value, float) else 0.0)
+        self._rested = time.monotonic() + (SLIDER_REST if isinstance(value, float) else 0.0)
 
     def _apply_inputs(self) -> None:
         """Applies the noted inputs: as an event if the field can change during a run, otherwise in a new run."""
@@ -366,7 +370,7 @@ class Live(Page):
         name, *rest = path
         if path == ("perturbation", "control_delay") and np.isfinite(value):  # in whole control periods
             value = round(value / self.session.period) * self.session.period
-        if name in PLANNED and self.session.avoid != "none":
+        if name in PLANNED_FIELDS and self.session.avoid != "none":
             raise InputError(
                 f"{name}: with --avoid {self.session.avoid} the robots take another goal, but no other {name}"
             )
@@ -382,10 +386,10 @@ class Live(Page):
             self._go_on()
             return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
-        touched = start[:1] if name in CONTROLLER else start
+        touched = start[:1] if name in CONTROLLER_FIELDS else start
         others = start[len(touched) :]
         new = [changed(self._present(s), path, value) for s in touched] + [self._present(s) for s in others]
-        if name in CONTROLLER:
+        if name in CONTROLLER_FIELDS:
             new = [new[0], *(s for s in new[1:] if s.feedforward != new[0].feedforward)]
         self._restart(new)
 
@@ -424,7 +428,7 @@ class Live(Page):
     def _begin(self, scenarios: Sequence[Scenario]) -> None:
         """Begins a run that has nothing of the one before, nor of a mission."""
         session = Session(scenarios)
-        self._searched = NOTHING
+        self._searched = NO_ARCS
         self._take(session)
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
@@ -476,7 +480,7 @@ class Live(Page):
     def shown(self) -> list[Recording]:
         if self.session.tick < 2:
             raise InputError("download: nothing has happened yet")
-        result = self.session.result(max(0, self.session.tick - round(LONGEST / self.session.period)))
+        result = self.session.result(max(0, self.session.tick - round(MAX_SECONDS / self.session.period)))
         return [Recording(result.isel(run=row)) for row in range(self.session.size)]
 
     # -- the loop ----------------------------------------------------------------------------------------------------
@@ -674,7 +678,7 @@ def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
 
 def _with_robot(scenario: Scenario, robot: RobotFile) -> Scenario:
     """Returns a scenario for another robot: with the same controller, seed and tier, and a reference that suits it."""
-    kept: dict[str, Any] = {name: getattr(scenario, name) for name in KEPT}
+    kept: dict[str, Any] = {name: getattr(scenario, name) for name in KEPT_FIELDS}
     world = scenario.world if scenario.world in WORLDS else "flat"
     return suited(Scenario(**kept, world=world, robot=robot, sensing=Sensing(tier=scenario.sensing.tier)))
 

@@ -8,22 +8,22 @@ import numpy as np
 import viser
 
 from mrctl.kernel import Array
-from mrctl.physics.obstacles import HEIGHT, quaternion
+from mrctl.physics.obstacles import WALL_HEIGHT, quaternion
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.viewer.looks import MAX_MARKED, Colour, Look, pale
-from mrctl.viewer.recording import ABOVE
+from mrctl.viewer.recording import PATH_HEIGHT
 from mrctl.viewer.sensors import outline
 from mrctl.viewer.shapes import add_mesh, ribbons, sides
 
 GOAL_COLOUR: Colour = (22, 163, 74)
-OUTLINE = 0.02  # m, width of the outlines at start and goal
-SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
-PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and the number from which on only some are drawn
+OUTLINE_WIDTH = 0.02  # m, width of the outlines at start and goal
+POINT_SIZE, SCAN_HEIGHT = 0.03, WALL_HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
+PARTICLE_SIZE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and the number from which on only some are drawn
 SEARCH_COLOUR: Colour = (148, 163, 184)
 MAP_COLOUR: Colour = (30, 41, 59)
-MAP_HEIGHT = HEIGHT + 0.02  # m
-COARSE, FAN_HEIGHT, MAX_ARCS = 4, 0.03, 5000  # of the drawn steps of a roll-out; m; about the number that is drawn
+MAP_HEIGHT = WALL_HEIGHT + 0.02  # m
+FAN_STRIDE, FAN_HEIGHT, MAX_ARCS = 4, 0.03, 5000  # of the drawn steps of a roll-out; m; about the number that is drawn
 
 
 class Navigation:
@@ -47,14 +47,14 @@ class Navigation:
         self._scene, self._height = scene, height
         self._ends = [
             add_mesh(
-                scene, f"/world/{name}", *ribbons(outline(footprint), OUTLINE),
+                scene, f"/world/{name}", *ribbons(outline(footprint), OUTLINE_WIDTH),
                 color=colour, side="double", visible=False,
             )
             for name, colour in (("start", REFERENCE_COLOUR), ("goal", GOAL_COLOUR))
         ]  # fmt: skip
         self._scans: list[viser.PointCloudHandle] = []
         for row, robot in enumerate(robots[:MAX_MARKED]):
-            for kind, size in (("scan", SCAN_POINT), ("particles", PARTICLE)):
+            for kind, size in (("scan", POINT_SIZE), ("particles", PARTICLE_SIZE)):
                 self._scans.append(
                     scene.add_point_cloud(
                         f"/world/{kind}/{row}", np.zeros((0, 3)), robot.colour, point_size=size, point_shape="circle",
@@ -87,7 +87,7 @@ class Navigation:
             mark.visible = ends is not None
             if ends is not None:
                 x, y, theta = ends[k]
-                mark.position, mark.wxyz = (x, y, self._height(x, y) + ABOVE), quaternion(theta)
+                mark.position, mark.wxyz = (x, y, self._height(x, y) + PATH_HEIGHT), quaternion(theta)
 
     def show_scans(self, scans: Sequence[tuple[Array, Array] | None]) -> None:
         """Draws what `Session.scan` returns, for each of the first robots; no scans hide all points."""
@@ -99,19 +99,19 @@ class Navigation:
                 if not np.array_equal(met.points, places):  # scans are rarer than pictures
                     some = found[1][:: max(1, len(found[1]) // MAX_PARTICLES), :2]
                     met.points = places
-                    particles.points = np.pad(some, [(0, 0), (0, 1)], constant_values=ABOVE).astype(np.float32)
+                    particles.points = np.pad(some, [(0, 0), (0, 1)], constant_values=PATH_HEIGHT).astype(np.float32)
 
     def show_considered(self, ways: Sequence[tuple[Array, Array] | None]) -> None:
         """Draws what `Session.considered` returns, for each of the first robots; no ways hide all."""
         for row, drawn in enumerate(self._fans):
             found = ways[row] if row < len(ways) else None
             for lines, places in zip(drawn, found or (None, None), strict=True):
-                _show_segments(lines, None if places is None else _segments(places[..., ::COARSE, :]), FAN_HEIGHT)
+                _show_segments(lines, None if places is None else _segments(places[..., ::FAN_STRIDE, :]), FAN_HEIGHT)
 
     def show_search(self, arcs: Array) -> None:
         """Draws the arcs of a search, ends in m, `(k, 2, 2)`; none hide them."""
         some = arcs[:: max(1, len(arcs) // MAX_ARCS)]
-        _show_segments(self._search, some if len(some) else None, ABOVE)
+        _show_segments(self._search, some if len(some) else None, PATH_HEIGHT)
 
 
 def _segments(ways: Array) -> Array:

@@ -231,7 +231,7 @@ class Page(ABC):
             size = f"<b>Errors are drawn {magnified} times.</b>" if magnified > 1 else "Errors have their true size."
             lines.append(
                 f"Outline: estimated posture. Black point: true position. Ellipse: {sensors.SIGMAS:g}σ of x and y "
-                f"({100 * sensors.SHARE:.1f} %). "
+                f"({100 * sensors.ELLIPSE_SHARE:.1f} %). "
                 f"Small points: fixes of the last {sensors.FIX_AGE:g} s. {size}"
             )
         self._sensed.content = block("sensors", *lines)

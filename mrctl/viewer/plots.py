@@ -44,7 +44,7 @@ if (!window.mrctlGoTo) {
         field.dispatchEvent(new Event('input', { bubbles: true }));
     }, true);
 }"></style>""".replace("GOTO", TIME := "Go to, s")
-LAST = 1e12  # place of what stands below the charts, which are added later; viser numbers elements from 1 on
+LAST_PLACE = 1e12  # place of what stands below the charts, which are added later; viser numbers elements from 1 on
 MAX_ROBOTS = 4  # number of robots whose curves are drawn
 
 
@@ -162,7 +162,7 @@ class Plots:
             self._score = gui.add_html("")
             self._cursor = gui.add_html("")
             gui.add_html(HOVER + GO_TO)
-            self._lessons = gui.add_html("", order=LAST)
+            self._lessons = gui.add_html("", order=LAST_PLACE)
             self.time = gui.add_number(TIME, 0.0, min=0.0, step=0.01, hint="A click on a curve sets it, too.")
 
     def set_robots(self, robots: Sequence[Look], period: float, obstacles: bool) -> None:

@@ -33,7 +33,7 @@ from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
 
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
-ABOVE = 0.01  # m, height of a path above the ground
+PATH_HEIGHT = 0.01  # m, height of a path above the ground
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
 
@@ -161,7 +161,7 @@ def path(rows: Rows, radius: float, height: float, magnified: int) -> Array:
         magnified: Factor on the deviation from the reference.
     """
     z = np.where(np.isfinite(rows["z"]), rows["z"], height)
-    return np.concatenate([drawn(rows, magnified), (z - radius + ABOVE)[..., None]], axis=-1)
+    return np.concatenate([drawn(rows, magnified), (z - radius + PATH_HEIGHT)[..., None]], axis=-1)
 
 
 def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows, Array | None]:

@@ -15,7 +15,7 @@ from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
-from mrctl.viewer.scatter import KNOWN, Scatter, in_words, numbers_of
+from mrctl.viewer.scatter import KNOWN_COLUMNS, Scatter, in_words, numbers_of
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE, error
@@ -219,6 +219,6 @@ def _stated(column: str, value: float) -> str:
     if isinstance(value, bool) or not np.isfinite(value):
         return ""
     factor, words = in_words(column)
-    text, _, unit = words.partition(", ") if column in METRICS or column in KNOWN else (words, "", "")
+    text, _, unit = words.partition(", ") if column in METRICS or column in KNOWN_COLUMNS else (words, "", "")
     number = f"{value:d}" if isinstance(value, int) else f"{factor * value:.4g}"
     return html.escape(f"{text}: {number} {unit}".rstrip())

@@ -22,9 +22,10 @@ from mrctl.viewer.shapes import add_mesh
 
 GLASS: Colour = (150, 155, 160)  # of the first robot while marks are drawn, which have its colour
 GHOST_OPACITY, GLASS_OPACITY = 0.5, 0.55
-HALO = 1.04  # size of a ghost, of which only the far side is drawn: a rim around a robot that stands in it
-SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
-TOGETHER, LABEL_ABOVE = 0.7, 0.4  # robot lengths: distance of robots that have one label; its height over the robot
+GHOST_SIZE = 1.04  # size of a ghost, of which only the far side is drawn: a rim around a robot that stands in it
+LAST_VISIBLE_GROUP = 2  # last visible geom group, as in MuJoCo's own viewer
+# robot lengths: distance of robots that have one label; its height over the robot
+LABEL_DISTANCE, LABEL_HEIGHT = 0.7, 0.4
 Dragged = Callable[[viser.SceneNodeDragEvent], None]
 
 
@@ -91,7 +92,9 @@ class Robots:
         for body in self._bodies:
             geoms = [
                 g for g in range(model.ngeom)
-                if model.geom_bodyid[g] == body and model.geom_group[g] <= SEEN and model.geom_rgba[g, 3] > 0
+                if model.geom_bodyid[g] == body
+                and model.geom_group[g] <= LAST_VISIBLE_GROUP
+                and model.geom_rgba[g, 3] > 0
             ]  # fmt: skip
             parts.append(_rough(model, geoms) if geoms else None)
             if geoms:
@@ -142,8 +145,8 @@ class Robots:
             if row and part is not None:
                 middle = part.bounds.mean(axis=0)
                 add_mesh(
-                    self._scene, f"{name}/mesh", middle + HALO * (part.vertices - middle), part.faces, side="back",
-                    color=self._robots[row].colour, opacity=GHOST_OPACITY, flat_shading=True,
+                    self._scene, f"{name}/mesh", middle + GHOST_SIZE * (part.vertices - middle), part.faces,
+                    side="back", color=self._robots[row].colour, opacity=GHOST_OPACITY, flat_shading=True,
                 )  # fmt: skip
         return frames
 
@@ -200,7 +203,7 @@ class Robots:
         """Moves the labels; robots that are close together have one label, which names at most three of them."""
         here, near = self.positions, {}
         for row in range(len(self._labels)):
-            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER * self.length), row)
+            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < LABEL_DISTANCE * self.length), row)
             near.setdefault(first, []).append(self._robots[row].label)
         for row, label in enumerate(self._labels):
             label.visible = row in near
@@ -209,7 +212,7 @@ class Robots:
                 more = f" + {len(names) - 2}" if len(names) > 3 else ""
                 text = ", ".join(names[: 2 if more else 3]) + more
                 label.text = text
-                label.position = here[row] + [0, 0, self.top - self._radius + LABEL_ABOVE * self.length]
+                label.position = here[row] + [0, 0, self.top - self._radius + LABEL_HEIGHT * self.length]
 
     def show_payload(self, row: int, perturbation: Perturbation) -> None:
         """Draws the payload of a robot as a cube with the density of water at its place; if there is none, nothing."""

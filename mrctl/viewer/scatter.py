@@ -13,18 +13,18 @@ from pandas.api.types import is_bool_dtype, is_numeric_dtype
 from viser import uplot
 
 from mrctl.record import InputError
-from mrctl.results.controllers import CONTROLLER, title_of
+from mrctl.results.controllers import CONTROLLER_FIELDS, title_of
 from mrctl.results.metrics import METRICS
 from mrctl.viewer.looks import Colour, looks
 from mrctl.viewer.page import block
 from mrctl.viewer.plots import CURSOR_COLOUR
 
-DROVE, FAILED = (71, 85, 105), (185, 28, 28)
-DOT, RING = 9.0, 20.0  # pixels, diameters of the dot of a run and of the ring around the one that is shown
+DROVE_COLOUR, FAILED_COLOUR = (71, 85, 105), (185, 28, 28)
+DOT_SIZE, RING_SIZE = 9.0, 20.0  # pixels, diameters of the dot of a run and of the ring around the one that is shown
 # Unit and words of the columns of a table that are not in `METRICS`.
-KNOWN = {"lap_time": ("s", "time of a lap"), "failure_time": ("s", "failed after"), "laps": ("1", "laps")}
-DECADES = 30.0  # ratio of largest to least beyond which an axis is logarithmic
-AROUND = 0.06  # share of an axis that is left free at its ends
+KNOWN_COLUMNS = {"lap_time": ("s", "time of a lap"), "failure_time": ("s", "failed after"), "laps": ("1", "laps")}
+LOGARITHMIC_RATIO = 30.0  # ratio of largest to least beyond which an axis is logarithmic
+AXIS_MARGIN = 0.06  # share of an axis that is left free at its ends
 RUN = "Run to show"  # label of a number field
 # A click near a run writes its number into that field; see `plots.GO_TO`.
 OPEN = """<style onload="
@@ -107,7 +107,7 @@ class Scatter:
         axes = columns[: columns.index("label")] if "label" in columns else []
         words = [name for name in axes if not is_numeric_dtype(table[name]) or is_bool_dtype(table[name])]
         chosen = next((name for name in words if len(set(table[name])) > 1), "feedforward")
-        chosen = "feedforward" if chosen in CONTROLLER else chosen  # which has a colour everywhere
+        chosen = "feedforward" if chosen in CONTROLLER_FIELDS else chosen  # which has a colour everywhere
         names = [str(name) for name in table[chosen].unique()] if chosen in table else []
         own = {name: look.colour for name, look in zip(names, looks(names, names), strict=True)} if names[1:] else {}
         return chosen, own
@@ -115,7 +115,7 @@ class Scatter:
     def _prepare(self) -> dict[str, uplot.Scale]:
         """Sets `data` and `logarithmic`, and returns the scales of the axes.
 
-        An axis of positive numbers that differ by more than a factor of `DECADES` is logarithmic.
+        An axis of positive numbers that differ by more than a factor of `LOGARITHMIC_RATIO` is logarithmic.
 
         Raises:
             InputError: No run has both numbers.
@@ -136,11 +136,11 @@ class Scatter:
         self.logarithmic, scales = [], dict[str, uplot.Scale](run={"range": (0.0, 1.0)})
         for name, numbers in (("x", across), ("y", up)):
             low, high = float(numbers.min()), float(numbers.max())
-            logarithmic = bool(0 < DECADES * low < high)
+            logarithmic = bool(0 < LOGARITHMIC_RATIO * low < high)
             if logarithmic:
-                ends = low * (low / high) ** AROUND, high * (high / low) ** AROUND
+                ends = low * (low / high) ** AXIS_MARGIN, high * (high / low) ** AXIS_MARGIN
             else:
-                free = AROUND * (high - low) or 0.5 * abs(high) or 0.5
+                free = AXIS_MARGIN * (high - low) or 0.5 * abs(high) or 0.5
                 ends = low - free, high + free
             scales[name] = {"time": False, "distr": 3 if logarithmic else 1, "range": ends}
             self.logarithmic.append(logarithmic)
@@ -148,11 +148,13 @@ class Scatter:
 
     def _series(self) -> tuple[uplot.Series, ...]:
         """Returns the series of `data`."""
-        dots = [*(self.colours()[1].values() or [DROVE]), FAILED]
+        dots = [*(self.colours()[1].values() or [DROVE_COLOUR]), FAILED_COLOUR]
         points: list[uplot.Series_Points] = [
-            {"show": True, "size": DOT, "width": 0, "fill": f"rgb{colour}"} for colour in dots
+            {"show": True, "size": DOT_SIZE, "width": 0, "fill": f"rgb{colour}"} for colour in dots
         ]
-        points.append({"show": True, "size": RING, "width": 3, "stroke": f"rgb{CURSOR_COLOUR}", "fill": "transparent"})
+        points.append(
+            {"show": True, "size": RING_SIZE, "width": 3, "stroke": f"rgb{CURSOR_COLOUR}", "fill": "transparent"}
+        )
         hidden: uplot.Series_Points = {"show": False}
         return (
             uplot.Series(label="across"),
@@ -194,7 +196,7 @@ def numbers_of(table: pd.DataFrame) -> list[str]:
 
 def in_words(column: str) -> tuple[float, str]:
     """Returns the factor on a column's values, and its name in words with the unit; errors are in mm, as in figures."""
-    unit, text = METRICS.get(column, KNOWN.get(column, ("1", column.replace(".", ", ").replace("_", " "))))
+    unit, text = METRICS.get(column, KNOWN_COLUMNS.get(column, ("1", column.replace(".", ", ").replace("_", " "))))
     if unit == "1":
         return 1.0, text
     milli = unit.startswith(("m", "rad"))

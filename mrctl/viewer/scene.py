@@ -29,8 +29,8 @@ from mrctl.viewer.cameras import OVERVIEW, TOP, fitted, to_see
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour, Look
 from mrctl.viewer.navigation import GOAL_COLOUR, Navigation
-from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
-from mrctl.viewer.robots import SEEN, Dragged, Robots, in_order
+from mrctl.viewer.recording import PATH_HEIGHT, Recording, event_times, joint_log, path
+from mrctl.viewer.robots import LAST_VISIBLE_GROUP, Dragged, Robots, in_order
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import pushed
@@ -39,20 +39,21 @@ from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons
 # Colours of the floor: its thin lines, its thick lines, its surface.
 LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)
 DARK_FLOOR = (52, 55, 60), (70, 74, 80), (36, 38, 42)
-HORIZON = 2.0, 9.0  # distances at which things begin to fade and are gone, in widths of the view
+FADING_DISTANCES = 2.0, 9.0  # distances at which things begin to fade and are gone, in widths of the view
 TRAIL_POINTS = 240  # number of points in the trail of a robot
 TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
 PATH_POINTS = 600  # number of points in the path of a finished run
 TARGET_ABOVE = 0.15  # height of targets over the robot, in diagonals of its outline
-CLEARANCE = 0.05  # m, least height of a camera above the floor
-ASPECT = 0.9  # of width to height of the picture in a page of which more is not known
-THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
-NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
+MIN_CAMERA_HEIGHT = 0.05  # m, least height of a camera above the floor
+DEFAULT_ASPECT = 0.9  # of width to height of the picture in a page of which more is not known
+TARGET_LINE_WIDTH = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
+TRAIL_STEP = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
 LINE_WIDTH = 0.004  # of the reference, as a share of the width of the view; trails, which are below, are twice as wide
-REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
-FLOOR = 80.0  # m, width of the floor that is drawn, of which the horizon hides what is far
-SHADE = 0.35  # opacity of shadows on the floor
-GRIP, GRIP_BELOW = 50.0, 0.02  # m, half the side of the floor that can be dragged on, and its depth below the floor
+CLICK_REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
+FLOOR_WIDTH = 80.0  # m, width of the floor that is drawn, of which the horizon hides what is far
+SHADOW_OPACITY = 0.35  # opacity of shadows on the floor
+# m, half the side of the floor that can be dragged on, and its depth below the floor
+GRIP_SIZE, GRIP_BELOW = 50.0, 0.02
 SQUARE = (-1, -1), (1, -1), (1, 1), (-1, 1)
 
 _NUMBERS = itertools.count()  # of scenes
@@ -106,7 +107,7 @@ class Scene:
         marked = list(enumerate(robots[:MAX_MARKED]))
         self._marks = [Marks(self._scene, row, footprint, look.colour) for row, look in marked]
         self._targets = [
-            Target(self._scene, row, top + TARGET_ABOVE * self.length, THICK * self.length, look.colour)
+            Target(self._scene, row, top + TARGET_ABOVE * self.length, TARGET_LINE_WIDTH * self.length, look.colour)
             for row, look in marked
         ]
         self.navigation = Navigation(self._scene, robots, footprint, self._height)
@@ -124,7 +125,7 @@ class Scene:
         for geom in range(model.ngeom):
             body = model.geom_bodyid[geom]
             still = model.body_weldid[body] == 0 or model.body_mocapid[body] >= 0  # obstacles on courses, too
-            if not still or model.geom_group[geom] > SEEN:
+            if not still or model.geom_group[geom] > LAST_VISIBLE_GROUP:
                 continue
             # A page gives a node the pose of the one that it replaces, if both have the same name.
             name, turn = f"/world/fixed/{self._number}/{geom}", np.zeros(4)
@@ -133,8 +134,8 @@ class Scene:
                 self._floor = data.geom_xmat[geom].reshape(3, 3)[:, 2].copy(), data.geom_xpos[geom].copy()
                 self._floors.append(
                     self._scene.add_grid(
-                        name, FLOOR, FLOOR, cell_size=0.5, section_size=1, plane_opacity=1.0, shadow_opacity=0.0,
-                        wxyz=turn, position=data.geom_xpos[geom],
+                        name, FLOOR_WIDTH, FLOOR_WIDTH, cell_size=0.5, section_size=1, plane_opacity=1.0,
+                        shadow_opacity=0.0,                         wxyz=turn, position=data.geom_xpos[geom],
                     )
                 )  # fmt: skip
             else:
@@ -172,7 +173,7 @@ class Scene:
         self._view = max(np.ptp(self._seen[:, :2], axis=0))
         self._middle = (self._seen.min(axis=0) + self._seen.max(axis=0)) / 2 * [1, 1, 0]
         colours = len({look.colour for look in self._looks})
-        lines[..., 2] += NEXT_TRAIL * (colours + 1)  # above all trails, which are wider
+        lines[..., 2] += TRAIL_STEP * (colours + 1)  # above all trails, which are wider
         self._draw_lines("/world/reference", lines, LINE_WIDTH * self._view, REFERENCE_COLOUR)
 
     def _lines(self, references: Sequence[Reference]) -> Array:
@@ -180,13 +181,13 @@ class Scene:
         lines = []
         for reference in references:
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
-            heights = [self._height(x, y) + ABOVE for x, y in pose[:, :2]]
+            heights = [self._height(x, y) + PATH_HEIGHT for x, y in pose[:, :2]]
             lines.append(np.column_stack([pose[:, :2], heights]))
         return np.stack(lines)
 
     def _look(self) -> None:
         """Sets the camera of pages to come, and of open ones if it is another than before."""
-        initial, (position, target) = self._server.initial_camera, self.camera(False, ASPECT)
+        initial, (position, target) = self._server.initial_camera, self.camera(False, DEFAULT_ASPECT)
         if np.allclose(initial.position, position):
             return
         initial.position, initial.look_at = position, target
@@ -236,13 +237,13 @@ class Scene:
         """Gives floor and horizon the colours of a dark or a light page, and, in soft light, shadows to what stands."""
         dark, soft = self._server.dark, self._server.soft
         for floor in self._floors:
-            floor.shadow_opacity = SHADE if soft else 0.0
+            floor.shadow_opacity = SHADOW_OPACITY if soft else 0.0
         for part in (*self.robots.held, *self._walls):
             part.cast_shadow = soft
         colours = DARK_FLOOR if dark else LIGHT_FLOOR
         for floor in self._floors:
             floor.cell_color, floor.section_color, floor.plane_color = colours
-        near, far = HORIZON[0] * self._view, HORIZON[1] * self._view
+        near, far = FADING_DISTANCES[0] * self._view, FADING_DISTANCES[1] * self._view
         colour = (20, 20, 20) if dark else (255, 255, 255)
         self._scene.configure_fog(near, far, color=colour, enabled=True)
 
@@ -255,7 +256,7 @@ class Scene:
         if self._posts is not None:
             self._posts.remove()
             self._posts = None
-        thick, posts = THICK * self.length, []
+        thick, posts = TARGET_LINE_WIDTH * self.length, []
         for x, y in zip(rows["x_ref"], rows["y_ref"], strict=True):
             if np.isfinite(x):
                 foot = np.array([x, y, self._height(x, y)])
@@ -270,7 +271,7 @@ class Scene:
     def above_floor(self, position: Array) -> Array:
         """Returns the nearest position to one in m, `(3,)`, from which a camera sees the floor from above."""
         normal, point = self._floor
-        return position + normal * max(0.0, CLEARANCE - normal @ (position - point - self._root.position))
+        return position + normal * max(0.0, MIN_CAMERA_HEIGHT - normal @ (position - point - self._root.position))
 
     def on_floor(self, origin: Array, direction: Array) -> Array | None:
         """Returns where a ray in a visitor's view meets the floor, x and y in m, `(2,)`; None where it does not."""
@@ -350,7 +351,7 @@ class Scene:
             self._way.append(
                 add_mesh(
                     self._scene, f"/world/way/{k}", *mesh, color=GOAL_COLOUR, side="double",
-                    position=(x, y, self._height(x, y) + 2 * ABOVE),
+                    position=(x, y, self._height(x, y) + 2 * PATH_HEIGHT),
                 )
             )  # fmt: skip
         if way is not None:
@@ -368,7 +369,7 @@ class Scene:
         if self._grip is None:
             normal, point = self._floor
             along, across = np.cross([0.0, 1, 0], normal), np.cross(normal, [1.0, 0, 0])
-            corners = [point - GRIP_BELOW * normal + GRIP * (a * along + b * across) for a, b in SQUARE]
+            corners = [point - GRIP_BELOW * normal + GRIP_SIZE * (a * along + b * across) for a, b in SQUARE]
             self._grip = add_mesh(
                 self._scene, "/world/grip", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), side="double"
             )
@@ -377,7 +378,7 @@ class Scene:
     @property
     def reach(self) -> float:
         """Distance in m from a trail within which a click on the floor is a click on it."""
-        return REACH * self._view
+        return CLICK_REACH * self._view
 
     @property
     def trail_points(self) -> int:
@@ -405,13 +406,13 @@ class Scene:
         """
         here = self.robots.positions
         paths = path(rows, self._radius, here[0, 2], magnified)
-        last = here - [0, 0, self._radius - ABOVE]
+        last = here - [0, 0, self._radius - PATH_HEIGHT]
         for row, line in enumerate(paths.swapaxes(0, 1)):
             known = np.isfinite(line).all(axis=-1)
             line[~known] = line[known][-1] if known.any() else last[row]
         colours = list(dict.fromkeys(look.colour for look in self._looks))
         groups = [
-            paths[:, [look.colour == colour for look in self._looks]].swapaxes(0, 1) + [0, 0, NEXT_TRAIL * k]
+            paths[:, [look.colour == colour for look in self._looks]].swapaxes(0, 1) + [0, 0, TRAIL_STEP * k]
             for k, colour in enumerate(colours)
         ]
         width = 2 * LINE_WIDTH * self._view

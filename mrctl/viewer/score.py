@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from mrctl.control.features import NAMES, feature_scale
+from mrctl.control.features import FEATURE_NAMES, feature_scale
 from mrctl.kernel import Array, Rows
 from mrctl.loop.goals import arrived
 from mrctl.loop.timeline import begun, ends, followed
@@ -17,20 +17,21 @@ from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
 
-OF_LAPS = (
+LAP_SCORES = (
     "error now, mm", "RMS of last lap, mm", "best lap, mm", "feedback in last lap, %", "energy of last lap, J",
     "excitation in last lap",
 )  # fmt: skip
-OF_WAY = (
+WAY_SCORES = (
     "off the timed plan now, mm", "RMS of that on the way, mm", "feedback on the way, %", "energy on the way, J",
     "excitation on the way",
 )  # fmt: skip
-FRESH, SHARE = 1.0, 0.02  # s, and a share of a way, by which a robot drives on until its metrics are computed again
+# s, and a share of a way, by which a robot drives on until its metrics are computed again
+FRESH_TIME, FRESH_SHARE = 1.0, 0.02
 
 # A row for each number and a column for each robot: the names of the numbers stay where many robots are scrolled.
-HEADING = "position:sticky;left:0;background:var(--mantine-color-body);padding-right:0.8em"
-NUMBER = "font-weight:500;text-align:right;vertical-align:bottom"
-SMALL = 1e-3  # below which a number is written with an exponent
+HEADING_STYLE = "position:sticky;left:0;background:var(--mantine-color-body);padding-right:0.8em"
+NUMBER_STYLE = "font-weight:500;text-align:right;vertical-align:bottom"
+EXPONENT_BELOW = 1e-3  # below which a number is written with an exponent
 
 
 def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[str, Array]]:
@@ -115,7 +116,7 @@ class Metrics:
         if (begin, way) != self._of or until < self._until:
             self._of, self._all, self._until, self._final = (begin, way), [], begin, False
         if way:
-            old = until - self._until >= max(FRESH / self._period, SHARE * (until - begin))
+            old = until - self._until >= max(FRESH_TIME / self._period, FRESH_SHARE * (until - begin))
             if not self._final and (old or (exact and until != self._until)):
                 goals = np.stack([np.full(3, np.nan) if found is None else found[1] for found in bounds])
                 self._all, self._final = on_the_way(log(begin, until), goals, self._period, self._robot)
@@ -153,7 +154,7 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]], w
         last["energy"],
         last["excitation"],
     ]
-    return _table("mrctl-score", "", robots, OF_WAY if way else OF_LAPS, columns)
+    return _table("mrctl-score", "", robots, WAY_SCORES if way else LAP_SCORES, columns)
 
 
 def lessons(robots: Sequence[Look], laps: Sequence[dict[str, Array]], way: bool, error: Array | None, when: str) -> str:
@@ -167,13 +168,13 @@ def lessons(robots: Sequence[Look], laps: Sequence[dict[str, Array]], way: bool,
             robot has any.
         when: When this error holds.
     """
-    excited = laps[-1]["alone"].T if laps else np.full((len(NAMES), len(robots)), np.nan)
+    excited = laps[-1]["alone"].T if laps else np.full((len(FEATURE_NAMES), len(robots)), np.nan)
     title = f"excitation alone, {'on the way' if way else 'last lap'}"
-    found = _table("mrctl-excitation", title, robots, NAMES, excited)
+    found = _table("mrctl-excitation", title, robots, FEATURE_NAMES, excited)
     if error is not None:
         for k, channel in enumerate("ΣΔ"):
             title = f"error of coefficient {channel}, prior and learner, V, {when}"
-            found += _table(f"mrctl-coefficients-{k}", title, robots, NAMES, error[:, :, k].T)
+            found += _table(f"mrctl-coefficients-{k}", title, robots, FEATURE_NAMES, error[:, :, k].T)
     return found
 
 
@@ -181,21 +182,21 @@ def _table(
     name: str, title: str, robots: Sequence[Look], headings: Sequence[str], rows: Iterable[Sequence[float]]
 ) -> str:
     """Returns a table in HTML with a row for each heading and a column for each robot."""
-    names = "".join(f'<th style="{NUMBER};color:rgb{r.colour}">{html.escape(r.label)}</th>' for r in robots)
+    names = "".join(f'<th style="{NUMBER_STYLE};color:rgb{r.colour}">{html.escape(r.label)}</th>' for r in robots)
     lines = "".join(
-        f'<tr><td style="{HEADING};white-space:nowrap">{heading}</td>{_cells(values)}</tr>'
+        f'<tr><td style="{HEADING_STYLE};white-space:nowrap">{heading}</td>{_cells(values)}</tr>'
         for heading, values in zip(headings, rows, strict=True)
     )
     return (
         f'<div style="margin:0.3em 1em;overflow-x:auto"><table id="{name}" style="font-size:0.75em">'
-        f'<tr><td style="{HEADING}">{title}</td>{names}</tr>{lines}</table></div>'
+        f'<tr><td style="{HEADING_STYLE}">{title}</td>{names}</tr>{lines}</table></div>'
     )
 
 
 def _cells(values: Sequence[float]) -> str:
     """Returns the cells of numbers to three digits; what is not known yet, or not any more, is a dash."""
-    texts = [f"{v:.2g}" if 0 < abs(v) < SMALL else _positional(v) if np.isfinite(v) else "–" for v in values]
-    return "".join(f'<td style="{NUMBER}">{text}</td>' for text in texts)
+    texts = [f"{v:.2g}" if 0 < abs(v) < EXPONENT_BELOW else _positional(v) if np.isfinite(v) else "–" for v in values]
+    return "".join(f'<td style="{NUMBER_STYLE}">{text}</td>' for text in texts)
 
 
 def _positional(value: float) -> str:

@@ -11,21 +11,21 @@ from mrctl.viewer.looks import Colour
 from mrctl.viewer.shapes import add_mesh, disc, ribbons
 
 SIGMAS = 3.0  # size of the ellipse in standard deviations
-SHARE = 1 - np.exp(-(SIGMAS**2) / 2)  # of a normal distribution on the plane, which the ellipse holds
+ELLIPSE_SHARE = 1 - np.exp(-(SIGMAS**2) / 2)  # of a normal distribution on the plane, which the ellipse holds
 FIX_AGE = 2.0  # s, after which a fix has faded
 MAX_FIXES = 20  # number of fixes that are shown of a robot
 MAGNIFICATIONS = (1, 10, 100)
-WIDEST = 0.5  # m, to which errors are magnified at the beginning
-RIM = 0.06  # width of the rim of an ellipse, as a share of its half axes
-TURN = np.linspace(0, 2 * np.pi, 49)
+MAX_MAGNIFIED = 0.5  # m, to which errors are magnified at the beginning
+RIM_WIDTH = 0.06  # width of the rim of an ellipse, as a share of its half axes
+CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)
 # Height in m of the first robot's marks over the ground, above the trails, and from one robot's marks to the next, and
 # from one kind of mark to the next; at the same height they would flicker.
-LEVEL, NEXT_ROBOT, NEXT_MARK = 0.012, 0.004, 0.001
+MARK_HEIGHT, NEXT_ROBOT, NEXT_MARK = 0.012, 0.004, 0.001
 
 
 def magnification(spread: float) -> int:
     """Returns the largest of `MAGNIFICATIONS` with which errors of `spread` in m stay in the picture."""
-    return max(m for m in MAGNIFICATIONS if m == 1 or m * spread <= WIDEST)
+    return max(m for m in MAGNIFICATIONS if m == 1 or m * spread <= MAX_MAGNIFIED)
 
 
 def ellipse(estimate: Row) -> tuple[Array, float]:
@@ -63,15 +63,15 @@ class Marks:
             footprint: Least and largest x and y of the robot in its own frame in m, `(2, 2)`.
             colour: Colour of the robot.
         """
-        name, self._level = f"/world/sensors/{row}", LEVEL + NEXT_ROBOT * row
+        name, self._level = f"/world/sensors/{row}", MARK_HEIGHT + NEXT_ROBOT * row
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         arrow = ribbons(outline(footprint), 0.014)
         self._estimate = add_mesh(scene, f"{name}/estimate", *arrow, color=colour, side="double")
-        circle = np.column_stack([np.cos(TURN), np.sin(TURN)])
+        circle = np.column_stack([np.cos(CIRCLE_ANGLES), np.sin(CIRCLE_ANGLES)])
         point = disc(0.016 * circle)
         self._truth = add_mesh(scene, f"{name}/truth", *point, color=(20, 20, 20), side="double")
         self._ellipse = scene.add_frame(f"{name}/ellipse", show_axes=False)
-        area, rim = disc(circle), ribbons(np.pad((1 - RIM / 2) * circle, [(0, 0), (0, 1)])[None], RIM)
+        area, rim = disc(circle), ribbons(np.pad((1 - RIM_WIDTH / 2) * circle, [(0, 0), (0, 1)])[None], RIM_WIDTH)
         self._area = add_mesh(scene, f"{name}/ellipse/area", *area, color=colour, opacity=0.5, side="double")
         self._rim = add_mesh(scene, f"{name}/ellipse/rim", *rim, color=colour, side="double")
         dark = np.tile(np.array(colour, np.uint8) // 2, (MAX_FIXES, 1))

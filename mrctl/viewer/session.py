@@ -18,9 +18,9 @@ from mrctl.loop.timeline import followed, state
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.plan import Plan
-from mrctl.navigation.planning import MARGIN, SLIM, Avoid, prepared
+from mrctl.navigation.planning import PLAN_MARGIN, REPLAN_MARGIN, Avoid, prepared
 from mrctl.navigation.reactive import Reactive
-from mrctl.physics.contacts import NOTHING, Contacts
+from mrctl.physics.contacts import NO_CONTACTS, Contacts
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
@@ -30,10 +30,10 @@ from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Pose, Surroundings, turned
 from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import Robot
-from mrctl.theory.timing import RESERVE, Limits
+from mrctl.theory.timing import LIMIT_SHARE, Limits
 
-HOUR = 3600.0  # s of simulated time after which a session ends
-SEEN_PUSH = 0.5  # s, for which a push is drawn, at least
+MAX_TIME = 3600.0  # s of simulated time after which a session ends
+MIN_PUSH_TIME = 0.5  # s, for which a push is drawn, at least
 SHARED_FIELDS = ("world", "obstacles", "map", "robot", "steering", "control_period", "physics_step")
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
@@ -67,7 +67,7 @@ class Session:
                 raise InputError(f"{name}: robots in one scene must share it")
         self.start = list(scenarios)
         self.period = scenarios[0].control_period
-        long = [s.model_copy(update={"laps": max(1, floor(HOUR / s.reference.period))}) for s in scenarios]
+        long = [s.model_copy(update={"laps": max(1, floor(MAX_TIME / s.reference.period))}) for s in scenarios]
         self.avoid: Avoid = avoid
         motion, self._stages = avoiding(avoid), []
 
@@ -186,7 +186,7 @@ class Session:
         near = clearance(self._footprint, np.array(start), Surroundings(first.known).at(0.0))
         plan = followed(self.saved()[0], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
-        margin = MARGIN if near > MARGIN else SLIM
+        margin = PLAN_MARGIN if near > PLAN_MARGIN else REPLAN_MARGIN
         found, driven = prepared(task, first, speed, margin, self.avoid, twist)
         self.apply(reference=driven.reference)
         return found
@@ -219,7 +219,7 @@ class Session:
         )
         found = Waypoints.from_dict({
             "points": [(x, y), ahead, *map(tuple, points)], "closed": closed, "timing": "limits",
-            "speed": min(speed, RESERVE * self.robot.max_speed), "limits": Limits.of(self.robot),
+            "speed": min(speed, LIMIT_SHARE * self.robot.max_speed), "limits": Limits.of(self.robot),
             "start_speed": 0.0 if closed else max(0.0, velocity),
         })  # fmt: skip
         check(found, self.robot, reverse=False)
@@ -352,7 +352,7 @@ class Session:
     def contacts(self, row: int) -> Contacts:
         """Returns what a robot touches now; nothing once it has stopped."""
         sim, k = self._place[row]
-        return NOTHING if sim.plant.failed[k] else sim.plant.contacts(k)
+        return NO_CONTACTS if sim.plant.failed[k] else sim.plant.contacts(k)
 
     def considered(self, row: int) -> tuple[Array, Array] | None:
         """Returns the ways that the avoider of a robot considered last, from the samples that it drew itself.
@@ -398,7 +398,7 @@ class Session:
 def pushed(scenario: Scenario, time: float) -> Array | None:
     """Returns the force of a push along the world's x and y in N, `(2,)`, that acts or is half a second old at most."""
     for event in scenario.events:
-        if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, SEEN_PUSH):
+        if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, MIN_PUSH_TIME):
             return np.array(event.push[:2])
     return None
 

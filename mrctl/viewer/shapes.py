@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array
 from mrctl.theory.obstacles import Outlines
 
-ROUND = 24  # sides of a circle that is drawn with segments
+CIRCLE_SIDES = 24  # sides of a circle that is drawn with segments
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
 
 
@@ -59,7 +59,7 @@ def bar(start: Array, end: Array, thickness: float) -> Mesh:
 
 def sides(outlines: Outlines) -> Array:
     """Returns the sides of obstacles as segments, those of circles as polygons, ends in m, `(k, 2, 2)`."""
-    turn = np.linspace(0, 2 * np.pi, ROUND + 1)
+    turn = np.linspace(0, 2 * np.pi, CIRCLE_SIDES + 1)
     rims = outlines.discs[:, None, :2] + outlines.discs[:, None, 2:] * np.column_stack([np.cos(turn), np.sin(turn)])
     round_ones = np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 2)
     return np.concatenate([round_ones, outlines.edges.reshape(-1, 2, 2)])

@@ -8,9 +8,9 @@ from mrctl.theory.robot import Robot
 
 Interval = tuple[float, float]
 
-AROUND = 5.0  # a slider shows a fifth to five times the default of a number of which nothing else is known
-LEAST = 1e-3  # a default below which a number does not fit into the box beside a slider
-LENGTHS = ("length", "radius", "size", "side", "distance")  # of references
+RANGE_FACTOR = 5.0  # a slider shows a fifth to five times the default of a number of which nothing else is known
+MIN_DEFAULT = 1e-3  # a default below which a number does not fit into the box beside a slider
+LENGTH_FIELDS = ("length", "radius", "size", "side", "distance")  # of references
 
 
 def slider_range(path: tuple[str, ...], field: FieldInfo, limits: Interval, robot: Robot) -> Interval | None:
@@ -33,10 +33,10 @@ def slider_range(path: tuple[str, ...], field: FieldInfo, limits: Interval, robo
         first, last = ends
     elif not isinstance(default, int | float) or default <= 0:
         return limits
-    elif not LEAST <= default < high:
+    elif not MIN_DEFAULT <= default < high:
         return None
     else:
-        first, last = default / AROUND if low > 0 else low, AROUND * default
+        first, last = default / RANGE_FACTOR if low > 0 else low, RANGE_FACTOR * default
     digits = "{:.0f}" if field.annotation is int else "{:.2g}"
     return max(low, float(digits.format(first))), min(high, float(digits.format(last)))
 
@@ -71,7 +71,7 @@ def _reference_ranges(robot: Robot) -> dict[str, Interval]:
     """Returns the ranges of the fields of references, by name."""
     size = robot.size
     return {
-        **dict.fromkeys(LENGTHS, (size / 2, 20 * size)),
+        **dict.fromkeys(LENGTH_FIELDS, (size / 2, 20 * size)),
         "shift": (-10 * size, 10 * size),
         "speed": (robot.max_speed / 20, robot.max_speed),
         "period": (1.0, 60.0),

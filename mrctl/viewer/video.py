@@ -24,11 +24,11 @@ from mrctl.physics.elements import bodies_of
 from mrctl.physics.hull import footprint
 from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW, draw_line
+from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW_PIXELS, draw_line
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Surroundings
-from mrctl.viewer.cameras import LEAST_VIEW, OVERVIEW, fitted, to_see
+from mrctl.viewer.cameras import MIN_VIEW, OVERVIEW, fitted, to_see
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
@@ -39,10 +39,11 @@ Picture = NDArray[np.uint8]
 SIZES = {".mp4": (1280, 720), ".gif": (640, 360)}  # pixels
 RATES = {".mp4": 25.0, ".gif": 12.5}  # pictures a second
 LINE_POINTS, TRAIL_POINTS = 200, 100
-TRAIL = 12.0  # s that a trail shows
+TRAIL_TIME = 12.0  # s that a trail shows
 GHOST_OPACITY = 0.25
-RARE = Image.Quantize.FASTOCTREE  # keeps the colours of thin trails, where the median cut keeps shades of the floor
-WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
+# Keeps the colours of thin trails, where the median cut keeps shades of the floor.
+PALETTE_METHOD = Image.Quantize.FASTOCTREE
+TRAIL_WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
 
 
 def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
@@ -79,7 +80,7 @@ def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
 
 
 def _write_gif(pictures: Iterable[Picture], out: Path) -> None:
-    first, *others = (Image.fromarray(picture).quantize(64, RARE) for picture in pictures)
+    first, *others = (Image.fromarray(picture).quantize(64, PALETTE_METHOD) for picture in pictures)
     first.save(out, save_all=True, append_images=others, duration=round(1000 / RATES[".gif"]), loop=0)
 
 
@@ -108,7 +109,10 @@ def _pictures(
     """
     model = mjcf.clone(recordings[0].model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = SHADOW, 0  # without a GPU these take most of the time
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = (
+        SHADOW_PIXELS,
+        0,
+    )  # without a GPU these take most of the time
     try:
         renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # each backend has errors of its own
@@ -118,7 +122,7 @@ def _pictures(
         first = recordings[0].scenario
         references = [first.reference, *(event.reference for event in first.events if event.reference)]
         courses = [one.sample(np.linspace(0, one.period, LINE_POINTS)).pose * [1, 1, 0] for one in references]
-        view = max(LEAST_VIEW, *np.ptp(np.concatenate(courses), axis=0))
+        view = max(MIN_VIEW, *np.ptp(np.concatenate(courses), axis=0))
         camera = _overview(model, first, np.concatenate([*courses, *map(_driven, recordings)]), width / height)
         data, option, nothing = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
         moving = Surroundings(recordings[0].scenario.obstacles)
@@ -133,17 +137,17 @@ def _pictures(
                 if row == 0:
                     renderer.update_scene(data, camera)
                     for course in courses:
-                        draw_line(scene, course + [0, 0, 0.004], 2 * WIDTH * view, REFERENCE_COLOUR)
+                        draw_line(scene, course + [0, 0, 0.004], 2 * TRAIL_WIDTH * view, REFERENCE_COLOUR)
                 else:
                     before = scene.ngeom
                     mujoco.mjv_addGeoms(model, data, option, nothing, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
                     for geom in scene.geoms[before : scene.ngeom]:
                         geom.rgba = [*np.array(robot.colour) / 255, GHOST_OPACITY]
                         geom.matid = -1
-                since, last = recording.index(time - TRAIL), recording.index(time)
+                since, last = recording.index(time - TRAIL_TIME), recording.index(time)
                 rows = recording.log[np.linspace(since, last, TRAIL_POINTS).astype(int)]
                 draw_line(
-                    scene, path(rows, radius, data.body("chassis").xpos[2], magnified), WIDTH * view, robot.colour
+                    scene, path(rows, radius, data.body("chassis").xpos[2], magnified), TRAIL_WIDTH * view, robot.colour
                 )
             yield _labelled(renderer.render(), f"{time:.1f} s, deviation of trails {magnified} times", robots)
 

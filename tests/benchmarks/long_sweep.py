@@ -72,7 +72,7 @@ def watch(folder: Path, runs: int, workers: int, every: float = 5.0) -> tuple[np
 
 def loop(_: int) -> float:
     """Steps/s of a loop of `mrctl bench` with 64 robots in `lab`, the tier of the sweep."""
-    return bench._compare(64, 1, 41, bench.CHUNK, "lab")["steps_per_second"]
+    return bench._compare(64, 1, 41, bench.TICKS_PER_TURN, "lab")["steps_per_second"]
 
 
 def side_by_side(workers: int) -> float:

@@ -38,7 +38,7 @@ def test_replay(size, threads):
         assert same
         assert closed > 0 < limit
     for simulation, start in zip(simulations, starts, strict=True):
-        assert simulation.tick == bench.WARM + 60
+        assert simulation.tick == bench.WARM_TICKS + 60
         assert (np.abs(simulation.plant.qpos[:, :2] - start[:, :2]).max(axis=1) > 0.05).all()  # they drive
         assert (simulation.hierarchy.weight_norm > 0).all()  # and learn
         assert not simulation.plant.failed.any()
@@ -71,7 +71,7 @@ def test_figures(figures):
     assert figures["threads"][0]["threads"] == 1
     for row in figures["robots"] + figures["threads"]:
         assert row["replayed_exactly"]
-        assert row["ticks"] == bench.WARM + 2 * max(2, row["threads"] * 30 // row["robots"])
+        assert row["ticks"] == bench.WARM_TICKS + 2 * max(2, row["threads"] * 30 // row["robots"])
         assert row["real_time_factor"] == pytest.approx(row["steps_per_second"] * 0.002)
         assert row["ratio"] > 0
     assert figures["today"]["steps_per_second"] > 0

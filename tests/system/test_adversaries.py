@@ -22,7 +22,7 @@ from mrctl import (
 )
 from mrctl.control.design import motion, points
 from mrctl.control.feedforward import Prior
-from mrctl.control.guard import ARM, TOLERATED, harmless
+from mrctl.control.guard import HEADING_ARM, TOLERATED_POSTURE, harmless
 from mrctl.control.rejection import LinearLoop, rejection
 from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation
@@ -261,13 +261,13 @@ def test_guarantee(steering, world):
         loops = loops._replace(kanayama=base.kanayama, prefilter=base.prefilter)
     region = base.guard.velocity * np.array([robot.max_speed, robot.max_rotation])
     deviation, within = harmless(region, np.array(rejection(robot, rigid, gains, loops, delay, PERIOD)))
-    corner = [{"velocity": region[k], "integral": 2 * deviation[k], "position": TOLERATED} for k in range(2)]
-    corner[1]["heading"] = TOLERATED / ARM
+    corner = [{"velocity": region[k], "integral": 2 * deviation[k], "position": TOLERATED_POSTURE} for k in range(2)]
+    corner[1]["heading"] = TOLERATED_POSTURE / HEADING_ARM
     k = loops.kanayama
-    corner[0]["correction"] = k.k_x * TOLERATED
-    corner[1]["correction"] = robot.max_speed * np.hypot(k.k_y, k.k_theta / ARM) * TOLERATED
+    corner[0]["correction"] = k.k_x * TOLERATED_POSTURE
+    corner[1]["correction"] = robot.max_speed * np.hypot(k.k_y, k.k_theta / HEADING_ARM) * TOLERATED_POSTURE
     bound = np.hypot(*recovery(robot, rigid, gains, loops, delay, corner))
-    assert TOLERATED < bound < 0.3
+    assert TOLERATED_POSTURE < bound < 0.3
 
     def worst(shares, frequency, on):
         class Worst(Adversary):
@@ -282,9 +282,9 @@ def test_guarantee(steering, world):
     calm = worst([0.99] * 3, frequencies, on=False)  # the guard ends oscillations
     assert not calm.failed.any()
     position = np.hypot(calm.x - calm.x_ref, calm.y - calm.y_ref)
-    posture = np.hypot(position, ARM * np.angle(np.exp(1j * (calm.theta - calm.theta_ref))))
+    posture = np.hypot(position, HEADING_ARM * np.angle(np.exp(1j * (calm.theta - calm.theta_ref))))
     slack = 1.5 if (steering, world) == ("rigid", "paper") else 1.0
-    assert posture.values.max() < slack * TOLERATED
+    assert posture.values.max() < slack * TOLERATED_POSTURE
     if not rigid:
         velocity = np.stack([calm.v_command - calm.v, calm.omega_command - calm.omega], axis=-1)
         assert (np.abs(velocity).max(axis=(0, 1)) < 1.05 * region).all()

@@ -12,7 +12,7 @@ from mrctl.navigation.mission import outcomes
 from mrctl.navigation.planning import Avoid, prepared
 from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
-from mrctl.theory.timing import RESERVE
+from mrctl.theory.timing import LIMIT_SHARE
 
 FIRST = 300_000  # seed, from which on nothing was chosen
 KINDS = "cellular", "corridor", "slalom", "doorway", "warehouse"
@@ -40,11 +40,11 @@ def unmapped(base: Scenario, seed: int) -> Task:
 def crossed(base: Scenario, seed: int) -> Task:
     """Makes a straight way that two discs cross at about the time at which a robot is there."""
     robot, random, discs = Vehicle.of(base).robot, np.random.default_rng([seed, 8]), []
-    most = min(0.8, RESERVE * robot.max_speed)
+    most = min(0.8, LIMIT_SHARE * robot.max_speed)
     for way in (2.0, 3.5):
         heading = random.choice([-1, 1]) * np.pi / 2 + random.uniform(-0.4, 0.4)
         speed = random.uniform(0.4 * most, most)
-        behind = speed * (way / (RESERVE * robot.max_speed) + random.uniform(-0.5, 0.5))
+        behind = speed * (way / (LIMIT_SHARE * robot.max_speed) + random.uniform(-0.5, 0.5))
         at = way * np.exp(-1j * heading) - behind  # as the disc counts, from the pose of its course
         discs.append(Disc(x=at.real, y=at.imag, radius=0.15, course=Line(heading=heading, speed=speed, length=30.0)))
     return Task(obstacles=Obstacles(shapes=tuple(discs)), start=(0, 0, 0), goal=(5, 0, 0))

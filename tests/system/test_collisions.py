@@ -13,7 +13,7 @@ from mrctl.physics import mjcf
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.files import models_folder
 from mrctl.physics.hull import footprint
-from mrctl.physics.obstacles import BIT, TALL, read_mjcf, to_mjcf
+from mrctl.physics.obstacles import CONTACT_BIT, HULL_HEIGHT, read_mjcf, to_mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Surroundings, turned
@@ -88,13 +88,13 @@ def touches_floor(model, data):
 def test_hull_passes_through_the_floor(name):
     """A robot that is put into the floor, its hull across the surface, has contacts there, but none of the hull."""
     model = mjcf.load(**ROBOTS[name], obstacles=wall(1.5))
-    data, middle = mujoco.MjData(model), TALL / 2
-    data.qpos[:7] = 0, 0, -middle, 1, 0, 0, 0  # the hull reaches from the axle up to `TALL`
+    data, middle = mujoco.MjData(model), HULL_HEIGHT / 2
+    data.qpos[:7] = 0, 0, -middle, 1, 0, 0, 0  # the hull reaches from the axle up to `HULL_HEIGHT`
     mujoco.mj_forward(model, data)
     floor = next(g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE)
     assert data.ncon > 0 and any(floor in pair for pair in data.contact.geom.tolist())
     assert not touches_floor(model, data) and data.sensor(COLLISION).data[0] == 0
-    model.geom_contype[floor] = model.geom_conaffinity[floor] = BIT  # so that the check above can fail
+    model.geom_contype[floor] = model.geom_conaffinity[floor] = CONTACT_BIT  # so that the check above can fail
     mujoco.mj_forward(model, data)
     assert touches_floor(model, data) and data.sensor(COLLISION).data[0] > 0
 

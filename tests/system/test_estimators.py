@@ -266,8 +266,8 @@ def test_within_three_deviations(tier, name):
 def test_jerked_wheels():
     """Wheels that slip by a fraction of a millimetre where a racing car brakes hard do not mislead the filter.
 
-    Without `ekf.SLIPPED` three of these robots are wrong by up to 0.2 m and 0.4 m/s, until fixes that they refuse are
-    accepted. `SLIPPED` was chosen with such robots in view.
+    Without `ekf.SLIP_SIGMAS` three of these robots are wrong by up to 0.2 m and 0.4 m/s, until fixes that they refuse
+    are accepted. `SLIPPED` was chosen with such robots in view.
     """
     base = suited(Scenario(robot=RobotFile(path="racecar"), prior="model", learner="none", laps=1))
     runs = simulate(replicates(base, 24, 100))
@@ -295,7 +295,7 @@ def test_lateral_slip():
     )
     product = (run.v * run.omega).values
     slope = (product @ run.v_lateral.values) / (product @ product)
-    assert -slope - 0.002 / 2 == pytest.approx(ekf.SIDE, rel=0.04)
+    assert -slope - 0.002 / 2 == pytest.approx(ekf.SIDE_SLIP_TIME, rel=0.04)
     rest = run.v_lateral.values - slope * product
     assert rest.std() < 0.01 * run.v_lateral.values.std()
 

@@ -153,7 +153,7 @@ def test_worlds_and_check(
     seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """A world or robot with wrong numbers, or without some lines, is compiled or refused; `check` has a verdict."""
-    monkeypatch.setattr(examination, "SECONDS", 0.2)
+    monkeypatch.setattr(examination, "MAX_SECONDS", 0.2)
     chance = random.Random(f"worlds {seed}")
     for k in range(20):
         name = chance.choice(["flat", "slope", "rough", "patch"]) if k < 18 else "turtlebot"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Event, Lemniscate, Perturbation, RobotFile, Scenario, per_lap, simulate
-from mrctl.control.delay import STEP
+from mrctl.control.delay import DELAY_STEP
 from mrctl.control.margins import Gains, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments import single
@@ -46,7 +46,7 @@ def test_late_motors(learner):
 def test_the_loop_in_theory(robot):
     """The gains in the end are stable with the true delay by the Nyquist curve of the linear loop, those before not."""
     result = simulate([late()])
-    added = STEP * (result["retunes"].values[0, -1] // 2)
+    added = DELAY_STEP * (result["retunes"].values[0, -1] // 2)
     frequency = np.geomspace(0.1, np.pi / 0.01 * 0.999, 4000)
 
     def peak(design):

@@ -74,7 +74,7 @@ def test_tight_spline(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
     task = task_of(world, scenario)
     for factor in (1.0, 30.0):  # the same plan again, and one of arcs for which there is no room
         with monkeypatch.context() as patch, pytest.raises(InputError, match="steering angle .* exceeds"):
-            patch.setattr(planning, "GENTLER", factor)
+            patch.setattr(planning, "GENTLER_FACTOR", factor)
             prepared(task, scenario)
     plan, drive = prepared(task, scenario)
     assert outcomes(simulate([drive]), task.goal, plan)["outcome"].tolist() == ["arrived"]

@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
         tier_runs = paper.real
         patch.setattr(paper, "real", lambda tier: [(name, run.replace(laps=2)) for name, run in tier_runs(tier)])
-        patch.setattr(paper, "LONG", 20)
+        patch.setattr(paper, "MANY_LAPS", 20)
         assert cli.main(["reproduce", "--out", str(out)]) == 0
     return out
 
@@ -133,8 +133,8 @@ def test_learning_stays_stable(table: dict) -> None:
 @pytest.mark.full
 def test_learning_stays_stable_for_long() -> None:
     """Lap 60 is at most 1.1 times lap 8."""
-    runs = [paper.scenario("fel", case, laps=paper.LONG) for case in ("nominal", paper.CASE)]
-    assert paper.LONG == 60
+    runs = [paper.scenario("fel", case, laps=paper.MANY_LAPS) for case in ("nominal", paper.CASE)]
+    assert paper.MANY_LAPS == 60
     check_stable(paper.endure(simulate(runs), runs))
 
 

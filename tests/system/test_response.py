@@ -9,9 +9,9 @@ from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments.paper import IDEAL
-from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
+from mrctl.experiments.response import PERIOD_TICKS, Shaker, estimate, lines, measure, multisine, refine, safety
 from mrctl.experiments.tuning import design, statement
-from mrctl.loop.hierarchy import TAKE_OVER
+from mrctl.loop.hierarchy import HAND_OVER_SHARE
 from mrctl.loop.simulation import Simulation
 from mrctl.physics.mjcf import load
 from mrctl.physics.parameters import read_robot
@@ -130,17 +130,17 @@ def test_hand_over_turns_the_condition():
             return self.output(None, None) - before
 
     frequency, (t,) = measure(scenarios(), 0)
-    harmonics = lines(SAMPLES)
-    wave = 0.03 * np.stack([multisine(SAMPLES, harmonics), np.zeros(SAMPLES)], axis=1)
-    shaker = HandedOver(wave, 2 * SAMPLES, 1)
+    harmonics = lines(PERIOD_TICKS)
+    wave = 0.03 * np.stack([multisine(PERIOD_TICKS, harmonics), np.zeros(PERIOD_TICKS)], axis=1)
+    shaker = HandedOver(wave, 2 * PERIOD_TICKS, 1)
     line = mrctl.Line(length=16)
     simulation = Simulation(
         [scenarios(reference=line, laps=1, initial_spread=(0, 0, 0))[0]], feedforward=lambda robot, size: shaker
     )
     while simulation.running:
         simulation.step()
-    answer = -estimate(wave[:, 0], shaker.feedback[SAMPLES:, 0, 0], harmonics)
-    np.testing.assert_allclose(answer, TAKE_OVER + (1 - TAKE_OVER) * t, atol=5e-3)
+    answer = -estimate(wave[:, 0], shaker.feedback[PERIOD_TICKS:, 0, 0], harmonics)
+    np.testing.assert_allclose(answer, HAND_OVER_SHARE + (1 - HAND_OVER_SHARE) * t, atol=5e-3)
 
 
 def test_refine():

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from mrctl import FEEDFORWARDS, Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
-from mrctl.control.features import NAMES
+from mrctl.control.features import FEATURE_NAMES
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.results.excitation import alone, parameter_error
@@ -155,7 +155,7 @@ def test_blocks(monkeypatch):
         BASE.model_copy(update={"reference": Circle(radius=0.6, period=4)}),
     ]
     whole = simulate(scenarios)
-    monkeypatch.setattr("mrctl.loop.courses.BLOCK", 97)
+    monkeypatch.setattr("mrctl.loop.courses.SAMPLED_TICKS", 97)
     parts = simulate(scenarios)
     for name in ("x_ref", "omega_ref", "x", "voltage_left"):
         assert parts[name].values.tobytes() == whole[name].values.tobytes()
@@ -177,7 +177,7 @@ def test_what_is_learned():
     excited, common, difference = pd.read_html(
         io.StringIO(lessons(robots, laps, False, error, "now")), header=0, index_col=0
     )
-    assert [*excited.index] == [*common.index] == [*NAMES] and [*excited.columns] == ["A & B", "fel"]
+    assert [*excited.index] == [*common.index] == [*FEATURE_NAMES] and [*excited.columns] == ["A & B", "fel"]
     motion = single.isel(run=0)
     twist = np.stack([motion.v_command.values, motion.omega_command.values], -1)
     there = alone(twist, session.period, motion.half_track.values, motion.feature_scale.values)

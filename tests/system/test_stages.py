@@ -18,8 +18,7 @@ from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop import user_files
 from mrctl.loop.simulation import simulate
-from mrctl.results.dataset import GAINS as RECORDED
-from mrctl.results.dataset import SIGNALS
+from mrctl.results.dataset import GAIN_VARIABLES, SIGNALS
 from mrctl.scenario import FEEDFORWARDS
 from mrctl.sweep import jobs
 from mrctl.sweep.store import Store
@@ -148,8 +147,8 @@ def test_same_law(own, steering):
         same(found, builtin)
     replaced = {"motion": {"k_x", "k_y", "k_theta"}, "feedback": {"k_p", "k_i"}}
     unused = {name for stage in own for name in replaced.get(stage, ())}
-    assert {name for name in RECORDED if found[name].isnull().all()} == unused
-    assert all(np.array_equal(found[name], builtin[name]) for name in set(RECORDED) - unused)
+    assert {name for name in GAIN_VARIABLES if found[name].isnull().all()} == unused
+    assert all(np.array_equal(found[name], builtin[name]) for name in set(GAIN_VARIABLES) - unused)
 
 
 def test_slow_motion():

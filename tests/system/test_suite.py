@@ -485,7 +485,7 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     words = ["suite", "--held-out", "none", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)]
     for _ in range(2):
         assert cli.main(words) == 0
-    begun, ended = map(json.loads, (tmp_path / held_out.LOG).read_text().splitlines())
+    begun, ended = map(json.loads, (tmp_path / held_out.LOG_FILE).read_text().splitlines())
     assert (begun["entry"], begun["replicates"], ended["says"] in capsys.readouterr().out) == ("none", 2, True)
     table = json.loads((tmp_path / "table.json").read_text())
     assert table["mode"] == "held-out" and len(table["cells"]) == 2 * 3 * 3 * 3

@@ -173,7 +173,7 @@ def test_other_workers(what, cluster, tmp_path, monkeypatch):
 
 def test_no_scheduler(tmp_path, capsys, monkeypatch):
     """One line that names the address."""
-    monkeypatch.setattr("mrctl.sweep.pool.PATIENCE", 1.0)
+    monkeypatch.setattr("mrctl.sweep.pool.SCHEDULER_PATIENCE", 1.0)
     file = tmp_path / "sweep.toml"
     file.write_text(FILE)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):

@@ -13,7 +13,7 @@ from PIL import Image
 
 from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
-from mrctl.control.features import NAMES
+from mrctl.control.features import FEATURE_NAMES
 from mrctl.loop.simulation import simulate
 from mrctl.results.excitation import alone
 from mrctl.results.metrics import per_lap
@@ -24,7 +24,7 @@ from mrctl.viewer.looks import looks
 from mrctl.viewer.plots import CURSOR_COLOUR
 from mrctl.viewer.recording import Library
 from mrctl.viewer.replay import Replay
-from mrctl.viewer.scatter import DROVE, RING
+from mrctl.viewer.scatter import DROVE_COLOUR, RING_SIZE
 from mrctl.viewer.server import Server
 
 CHROMIUM = shutil.which("chromium")
@@ -613,7 +613,7 @@ def test_replay(browser, tmp_path):
         motion = (result[name].values[:1, 600:1200] for name in ("v_command", "omega_command"))
         excited = alone(np.stack([*motion], -1), 0.01, result.half_track.values[:1], result.feature_scale.values[:1])[0]
         lines = page.inner_text("#mrctl-excitation").splitlines()[1:]
-        assert [line.split("\t")[0] for line in lines] == [*NAMES]
+        assert [line.split("\t")[0] for line in lines] == [*FEATURE_NAMES]
         assert [float(line.split("\t")[1]) for line in lines] == pytest.approx(excited, rel=0.05)
         stated = f"RMS distance to the reference: {1e3 * laps.position_rmse.values[0, 1]:.4g} mm"
         assert stated in page.inner_text("#mrctl-status") and "_" not in page.inner_text("#mrctl-status")
@@ -861,10 +861,10 @@ def test_sweep(browser, tmp_path):
         order = np.argsort(factors)
         np.testing.assert_allclose(scatter.data[2], 1e3 * library.table["position_rmse"].to_numpy()[order])
         at = page.evaluate(DOT, order.tolist().index(4))
-        assert pixel(page, tmp_path / "sweep.png", at) == DROVE  # a dot is where the run is
+        assert pixel(page, tmp_path / "sweep.png", at) == DROVE_COLOUR  # a dot is where the run is
         page.mouse.click(at[0] + 3, at[1] - 3)
         until(lambda: replay.runs == [4], "the run to open")
-        ring = at[0] + RING / 2 - 1, at[1]
+        ring = at[0] + RING_SIZE / 2 - 1, at[1]
         until(lambda: pixel(page, tmp_path / "opened.png", ring) == CURSOR_COLOUR, "the ring")
         assert page.get_by_label("Run to show").input_value() == "4"
         library.table["energy"] = [0.1, 1.0, 10.0, 100.0, 1e3, 1e4]  # J

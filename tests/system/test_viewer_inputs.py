@@ -18,7 +18,7 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
 from mrctl.theory.robot import RobotFile
 from mrctl.viewer import live as module
-from mrctl.viewer.controls import ANEW, ANEW_HINT
+from mrctl.viewer.controls import NEW_RUN_HINT, NEW_RUN_MARK
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
 from mrctl.viewer.stories import STORIES
@@ -171,8 +171,11 @@ def test_marks(live):
     live._restart([Scenario()])
     for (first, *_), handle in live._controls._inputs.items():
         anew = first not in CHANGEABLE
-        assert (ANEW in handle.label, ANEW_HINT in (handle.hint or "")) == (anew, anew), handle.label
-    assert live._controls._inputs["learner",].label == f"learner{ANEW}" and live._robot.label == f"robot{ANEW}"
+        assert (NEW_RUN_MARK in handle.label, NEW_RUN_HINT in (handle.hint or "")) == (anew, anew), handle.label
+    assert (
+        live._controls._inputs["learner",].label == f"learner{NEW_RUN_MARK}"
+        and live._robot.label == f"robot{NEW_RUN_MARK}"
+    )
 
 
 def test_hints_say_the_limits(live):

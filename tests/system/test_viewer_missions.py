@@ -27,7 +27,7 @@ from mrctl.results.metrics import per_lap
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import turned
 from mrctl.viewer import view as viewing
-from mrctl.viewer.cameras import FULL
+from mrctl.viewer.cameras import FILLED_SHARE
 from mrctl.viewer.export import _curves
 from mrctl.viewer.live import SAMPLES, WINDOW, Live
 from mrctl.viewer.page import arrivals
@@ -660,14 +660,16 @@ def test_goal_by_click(tmp_path):
 
             for width in (1280, 1500):  # the overview fits into the picture, whatever its shape is
                 page.set_viewport_size({"width": width, "height": 800})
-                until(lambda: np.abs(edges()).max() == pytest.approx(FULL, abs=1e-3), "a full picture")
+                until(lambda: np.abs(edges()).max() == pytest.approx(FILLED_SHARE, abs=1e-3), "a full picture")
                 assert edges()[0] == pytest.approx(-edges()[1], abs=2e-3)
             click(page, (0.9, -0.5), (0.9, -1.2))
             until(lambda: len(live.session.saved()[0].events) == 1, "the plan")
             set_at = live.session.saved()[0].events[0].time
             until(lambda: place(page, "/world/goal") == pytest.approx([0.9, -0.5], abs=0.03), "the goal in sight")
             page.set_viewport_size({"width": 1280, "height": 800})
-            until(lambda: np.abs(edges()).max() == pytest.approx(FULL, abs=1e-3), "a full picture of the new way")
+            until(
+                lambda: np.abs(edges()).max() == pytest.approx(FILLED_SHARE, abs=1e-3), "a full picture of the new way"
+            )
             live.ask(live.choose_speed, "as fast as it goes")
             until(lambda: live.session.time > set_at + 2, "the robots to drive")
             until(lambda: page.inner_text("#mrctl-status").count("has arrived") == 2, "the robots at the goal")

@@ -11,8 +11,8 @@ from mrctl import Scenario
 from mrctl.navigation.planning import prepared
 from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
-from mrctl.physics.obstacles import HEIGHT
-from mrctl.viewer.cameras import FULL, OVERVIEW, TOP, fitted
+from mrctl.physics.obstacles import WALL_HEIGHT
+from mrctl.viewer.cameras import FILLED_SHARE, OVERVIEW, TOP, fitted
 from mrctl.viewer.video import _overview
 
 FOV = np.radians(75)
@@ -37,7 +37,7 @@ def test_full_picture(seed, aspect, side, flat):
     points[:, 2] *= not flat
     position, target = fitted(points, side, FOV, aspect)
     seen = picture(points, position, target, aspect)
-    assert np.abs(seen).max() == pytest.approx(FULL, abs=1e-6)
+    assert np.abs(seen).max() == pytest.approx(FILLED_SHARE, abs=1e-6)
     assert seen.min(axis=0) == pytest.approx(-seen.max(axis=0), abs=1e-6)
     assert target[2] == pytest.approx(points[:, 2].min())
     assert np.cross(target - position, side) == pytest.approx([0, 0, 0], abs=1e-6 * np.linalg.norm(target - position))
@@ -55,9 +55,9 @@ def test_video_of_a_mission():
     around = np.linspace(0, 2 * np.pi, 40)
     posts = [
         [d.x + d.radius * np.cos(a), d.y + d.radius * np.sin(a), z]
-        for d, a, z in itertools.product(scenario.obstacles.shapes, around, (0.0, HEIGHT))
+        for d, a, z in itertools.product(scenario.obstacles.shapes, around, (0.0, WALL_HEIGHT))
     ]
     fov = np.radians(model.vis.global_.fovy)
     position = camera.lookat - camera.distance * ahead
     seen = np.abs(picture(np.vstack([course, posts, beside]), position, camera.lookat, 16 / 9, fov)).max(axis=0)
-    assert 0.75 < seen.max() <= FULL + 1e-6  # the robot at the ends takes the rest
+    assert 0.75 < seen.max() <= FILLED_SHARE + 1e-6  # the robot at the ends takes the rest

@@ -8,7 +8,7 @@ from mrctl.experiments import cases
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
-from mrctl.theory.perturbation import UNKNOWN
+from mrctl.theory.perturbation import REPLICATE_HALF_WIDTHS
 from mrctl.theory.references import check
 
 PLAIN = Perturbation()
@@ -57,7 +57,10 @@ def test_steps_are_where_the_laps_say():
             assert laps == [case.change, case.back] and case.back + 1 <= case.scenarios[0].laps
             start, changed, back = case.scenarios[0].perturbation, *(e.perturbation for e in events)
             assert len({start, changed, back}) == 3
-            for name, width in UNKNOWN.items():  # another draw, but of the wheels, which stay what they are
+            for (
+                name,
+                width,
+            ) in REPLICATE_HALF_WIDTHS.items():  # another draw, but of the wheels, which stay what they are
                 assert abs(getattr(back, name) - 1) <= width
                 assert (getattr(back, name) == getattr(start, name)) == ("radius" in name)
             assert back.slope == start.slope
@@ -93,8 +96,8 @@ def test_random_scenario_is_a_function_of_its_seed(robot):
 def test_random_robots_can_follow_and_stand(robot):
     """Each reference changes its speed, keeps its margin, and has a lap time of the list; no payload tips the robot."""
     limits = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
-    careful = {name: 1.01 * cases.MARGIN * getattr(robot, name) for name in limits}
-    careful = robot.model_copy(update={**careful, "tyre_friction": 1.01 * cases.GRIP})
+    careful = {name: 1.01 * cases.LIMIT_SHARE * getattr(robot, name) for name in limits}
+    careful = robot.model_copy(update={**careful, "tyre_friction": 1.01 * cases.RELIED_FRICTION})
     nominal, spread = mjcf.load(), []
     for scenario in cases.random_scenarios(12):
         course = scenario.reference

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl import Box, Disc, Obstacles, Polygon
-from mrctl.navigation.chart import SCANS, Chart
+from mrctl.navigation.chart import GONE_SCANS, Chart
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.rays import Scan
@@ -35,14 +35,14 @@ def test_gone_and_back(thing: str) -> None:
     """It goes after so many scans that pass through it, alone, and is back with the first scan that shows it."""
     full, rest = Obstacles(shapes=(*ROOM, THINGS[thing])), Obstacles(shapes=ROOM)
     chart, random, pose = Chart(full), np.random.default_rng(0), np.array([-0.5, 0.0, 0.0])
-    changes = [chart.see(scan(LIDAR, rest, pose, random)) for _ in range(SCANS + 2)]
-    assert changes == [k == SCANS - 1 for k in range(SCANS + 2)]
+    changes = [chart.see(scan(LIDAR, rest, pose, random)) for _ in range(GONE_SCANS + 2)]
+    assert changes == [k == GONE_SCANS - 1 for k in range(GONE_SCANS + 2)]
     for left, right in zip(chart.outlines, Surroundings(rest).at(0.0), strict=True):
         np.testing.assert_array_equal(left, right)
     assert chart.see(scan(LIDAR, full, pose, random))
     for left, right in zip(chart.outlines, chart.known, strict=True):
         np.testing.assert_array_equal(left, right)
-    for _ in range(SCANS):
+    for _ in range(GONE_SCANS):
         chart.see(scan(LIDAR, rest, pose, random))
     assert chart.outlines is not chart.known
     chart.forget()
@@ -71,7 +71,7 @@ def test_what_stands_stays(seed: int) -> None:
         pose = random.uniform([-3.8, -3.8, -3], [3.8, 3.8, 3])
         error = *(0.04 / np.sqrt(2) * random.choice([-1, 1], 2)), np.deg2rad(random.choice([-1.5, 1.5]))
         if solid.distance(shapely.Point(pose[:2])) > 0.2:
-            for _ in range(2 * SCANS):  # it stands a moment, and errs the same way
+            for _ in range(2 * GONE_SCANS):  # it stands a moment, and errs the same way
                 assert not chart.see(scan(lidar, world, pose, random, error))
 
 
@@ -79,5 +79,5 @@ def test_what_is_hidden_stays() -> None:
     """What no beam reaches, behind a wall or beyond the range, stays on the map."""
     wall, behind, far = Box(x=1.0, length=0.1, width=2.0), Disc(x=2.0, radius=0.3), Disc(x=-9.0, radius=0.3)
     chart, near = Chart(Obstacles(shapes=(wall, behind, far))), Lidar(range=6.0)
-    for _ in range(3 * SCANS):
+    for _ in range(3 * GONE_SCANS):
         assert not chart.see(scan(near, Obstacles(shapes=(wall,)), np.zeros(3), np.random.default_rng(0)))

@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from mrctl.control.composite import (
     COMPOSITE,
     REGRESSORS,
-    SCATTER,
+    SCATTER_GAIN,
     STEERING_DISTURBANCE,
     Composite,
     CompositeAdaptation,
@@ -230,7 +230,7 @@ def test_noise_counts(robot, channel, rigid):
     assert pupil.rows["variance"][0, 1 - channel] == 0
     settings = Composite()
     scale = np.array([1.0, STEERING_SCALE if rigid else 1.0])
-    per_speed = scale * SCATTER * [1.0, robot.half_track]
+    per_speed = scale * SCATTER_GAIN * [1.0, robot.half_track]
     noise = (scale * settings.noise) ** 2 + per_speed**2 * pupil.rows["variance"][0]
     pupil.rows["P"][:] = 0.0
     pupil.rows["P"][0, :, REGRESSORS, REGRESSORS] = before = 0.01

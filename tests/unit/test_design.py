@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from mrctl.control.design import (
+    CORRECTED_ERROR,
     DAMPING,
-    ERROR,
     M_S,
     M_T,
+    MOTION_PEAK_FACTOR,
     PUBLISHED_K_THETA,
     PUBLISHED_K_X,
-    SPEEDS,
-    WHOLE,
+    SPEED_SHARES,
     design,
     fastest,
     motion,
@@ -24,7 +24,7 @@ from mrctl.control.design import (
     sensitivity,
     whole_loop,
 )
-from mrctl.control.guard import ARM
+from mrctl.control.guard import HEADING_ARM
 from mrctl.control.pid import Pid
 from mrctl.control.rejection import LinearLoop
 from mrctl.record import InputError
@@ -115,7 +115,7 @@ def test_every_speed_is_robust(robot, steering):
         for channel in (0, 1):
             found = [peaks(plant, gains[channel], periods)[0] for plant in plants(robot, rigid, channel)]
             assert max(found) <= M_S * 1.002
-    assert SPEEDS[0] == 0.5
+    assert SPEED_SHARES[0] == 0.5
 
 
 def test_centre_of_mass_behind_the_axle(robot):
@@ -146,7 +146,7 @@ def test_a_given_prefilter(robot):
     assert own.kanayama.k_x * own.kanayama.k_y**0.5 >= max(m.kanayama.k_x * m.kanayama.k_y**0.5 for m in (fast, slow))
     for found in (fast, own, slow):
         peaks = sensitivity(robot, True, gains, vector(found.kanayama), found.prefilter, 2 * H)
-        assert (peaks < 1.001 * WHOLE * M_S).all()
+        assert (peaks < 1.001 * MOTION_PEAK_FACTOR * M_S).all()
 
 
 @pytest.mark.parametrize("steering", list(ARRANGEMENTS))
@@ -212,7 +212,7 @@ def test_motion_controller(robot, steering, delay):
     assert kanayama.k_theta > omega * robot.max_speed * kanayama.k_y
     assert kanayama.k_theta**2 == pytest.approx(4 * kanayama.k_y)
     # A step of the error is corrected within the limits on acceleration: at K e, and as fast as the loop moves.
-    reach = kanayama.k_x**2 * ERROR, robot.max_speed**2 * kanayama.k_y**1.5 * ERROR
+    reach = kanayama.k_x**2 * CORRECTED_ERROR, robot.max_speed**2 * kanayama.k_y**1.5 * CORRECTED_ERROR
     limits = robot.max_acceleration, robot.max_rotation_acceleration
     assert all(most <= limit * (1 + 1e-9) for most, limit in zip(reach, limits, strict=True))
     capped = [most == pytest.approx(limit) for most, limit in zip(reach, limits, strict=True)]
@@ -220,9 +220,9 @@ def test_motion_controller(robot, steering, delay):
     # max |S| keeps its bound. Each gain is at a bound, or 10 % more would break that on max |S|.
     peaks = sensitivity(robot, rigid, gains, vector(kanayama), prefilter, delay)
     more = sensitivity(robot, rigid, gains, vector(kanayama) * np.array([1.1, 1.21, 1.1]), prefilter, delay)
-    assert (peaks <= 1.001 * WHOLE * M_S).all()
-    assert capped[0] or damping(v, 1, kanayama.k_x) == pytest.approx(DAMPING) or more[0] > WHOLE * M_S
-    assert capped[1] or lateral[-1] == pytest.approx(DAMPING) or more[1] > WHOLE * M_S
+    assert (peaks <= 1.001 * MOTION_PEAK_FACTOR * M_S).all()
+    assert capped[0] or damping(v, 1, kanayama.k_x) == pytest.approx(DAMPING) or more[0] > MOTION_PEAK_FACTOR * M_S
+    assert capped[1] or lateral[-1] == pytest.approx(DAMPING) or more[1] > MOTION_PEAK_FACTOR * M_S
 
 
 def vector(kanayama):
@@ -241,7 +241,7 @@ def test_the_prefilter_is_the_best(robot, steering, delay):
     found = motion(robot, rigid, gains, delay)
     least = max(H, *(lag / 2 for lag in found.lag))
     alone = sensitivity(robot, rigid, gains, np.zeros(3), least, delay)
-    bounds = WHOLE * np.maximum(M_S, alone)
+    bounds = MOTION_PEAK_FACTOR * np.maximum(M_S, alone)
 
     def largest(allowed, most):
         low, high = 0.0, most
@@ -259,11 +259,11 @@ def test_the_prefilter_is_the_best(robot, steering, delay):
 
         def common(k):
             peak = sensitivity(robot, rigid, gains, np.array([k, 0, 0]), prefilter, delay)[0]
-            return peak <= bounds[0] and damped(v, 1, k) and k**2 * ERROR <= robot.max_acceleration
+            return peak <= bounds[0] and damped(v, 1, k) and k**2 * CORRECTED_ERROR <= robot.max_acceleration
 
         def second(k):
             peak = sensitivity(robot, rigid, gains, np.array([0, k**2, 2 * k]), prefilter, delay)[1]
-            reach = speed**2 * k**3 * ERROR <= robot.max_rotation_acceleration
+            reach = speed**2 * k**3 * CORRECTED_ERROR <= robot.max_rotation_acceleration
             return peak <= bounds[1] and damped(omega, 1, 2 * k * speed, (k * speed) ** 2) and reach
 
         return largest(common, PUBLISHED_K_X) * largest(second, PUBLISHED_K_THETA / 2)
@@ -286,7 +286,7 @@ def test_whole_loop(robot, steering, late):
     robot, rigid = arranged(robot, steering), steering == "rigid"
     gains = design(robot, rigid, late * H)
     over = motion(robot, rigid, gains, late * H)
-    k, ticks, speed = over.kanayama, 6000, SPEEDS[0] * robot.max_speed
+    k, ticks, speed = over.kanayama, 6000, SPEED_SHARES[0] * robot.max_speed
     frequency = np.array([3.0, 10.0, 30.0, 80.0, 200.0])
     for channel, with_model in product((0, 1), (False, True)):
         plant = plants(robot, rigid, channel)[0]
@@ -298,7 +298,7 @@ def test_whole_loop(robot, steering, late):
             (robot.rotation_gain, robot.rotation_time_constant),
         )[channel]
         for n in range(ticks):
-            errors[:, n] = c - state[0], -place, -ARM * heading
+            errors[:, n] = c - state[0], -place, -HEADING_ARM * heading
             v, x, y = state[0], place, heading
             for rate in rates:  # prediction from the measurement to the moment at which the voltage acts
                 if channel == 0:

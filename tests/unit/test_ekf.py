@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from mrctl.physics.plant import PLANT
 from mrctl.sensing import ekf as laws
-from mrctl.sensing.ekf import EKF, FIX_GATE, LOST
+from mrctl.sensing.ekf import EKF, FIX_GATE, LOST_FIXES
 from mrctl.sensing.estimators import GEOMETRY, Estimator
 from mrctl.sensing.prediction import wrapped
 from mrctl.sensing.sensors import SAMPLE, Sensors
@@ -31,7 +31,7 @@ def motion(x, force, theta_dot_dot, growth):
     acceleration = force - x[OFFSET]
     v, omega = x[V] + acceleration * MIDDLE, x[OMEGA] + theta_dot_dot * MIDDLE
     # The rear axle moves along θ − c θ̇.
-    heading = x[THETA] + omega * T / 2 - laws.SIDE * omega
+    heading = x[THETA] + omega * T / 2 - laws.SIDE_SLIP_TIME * omega
     new = np.array(x, np.result_type(x, force))
     new[X] += T * v * np.cos(heading)
     new[Y] += T * v * np.sin(heading)
@@ -53,17 +53,19 @@ def jacobian(f, x):
 def process_noise(x, grip, s, force, theta_dot_dot, growth, jolt):
     """Returns the covariance that a period adds."""
     omega = x[OMEGA] + theta_dot_dot * MIDDLE
-    heading = x[THETA] + omega * T / 2 - laws.SIDE * omega
+    heading = x[THETA] + omega * T / 2 - laws.SIDE_SLIP_TIME * omega
     across = np.array([-np.sin(heading), np.cos(heading)])
     Q = np.zeros((N, N))
     Q[:2, :2] = T * (laws.SIDE_SLIP if grip.all() else laws.SKID) ** 2 * np.outer(across, across)
-    Q[V, V] = 0 if grip.any() else T * laws.LOOSE_V**2
+    Q[V, V] = 0 if grip.any() else T * laws.SLIPPING_NOISE**2
     inputs = jacobian(lambda u: motion(x, u[0], u[1], growth), np.array([force, theta_dot_dot]))
-    Q += inputs @ np.diag([s["acceleration_variance"], laws.TURN**2 / T]) @ inputs.T
+    Q += inputs @ np.diag([s["acceleration_variance"], laws.YAW_NOISE**2 / T]) @ inputs.T
     Q[BIAS, BIAS] = T * s["bias_walk"] ** 2
-    Q[OFFSET, OFFSET] = T * (s["offset_walk"] ** 2 + (s["offset"] - x[OFFSET]) ** 2 / laws.SETTLE)
+    Q[OFFSET, OFFSET] = T * (s["offset_walk"] ** 2 + (s["offset"] - x[OFFSET]) ** 2 / laws.OFFSET_SETTLING)
     for wheel, scale in ((LEFT, SCALE_LEFT), (RIGHT, SCALE_RIGHT)):
-        Q[wheel, wheel] += (laws.JOLT * jolt) ** 2 + (T * (laws.SLIDE / RADIUS) ** 2 if grip.sum() == 1 else 0)
+        Q[wheel, wheel] += (laws.JOLT_SLIP * jolt) ** 2 + (
+            T * (laws.SLIDE_NOISE / RADIUS) ** 2 if grip.sum() == 1 else 0
+        )
         Q[scale, scale] = T * laws.RADIUS_WALK**2
     return Q
 
@@ -84,8 +86,8 @@ def textbook(s, sample, before, theta_dot_dot, loading):
     force, growth = sample["acceleration"][0] + AHEAD * x[OMEGA] ** 2, LOAD * sample["acceleration"][1]
     F = jacobian(lambda z: motion(z, force, theta_dot_dot, growth), x)
     jump = abs(sample["acceleration"][0] - before["acceleration"][0])
-    jolt = max(0, jump - laws.JUMP * np.sqrt(2 * s["acceleration_variance"]))
-    Q = process_noise(x, grip, s, force, theta_dot_dot, growth, max(jolt, laws.LOAD) if loading else jolt)
+    jolt = max(0, jump - laws.JUMP_SIGMAS * np.sqrt(2 * s["acceleration_variance"]))
+    Q = process_noise(x, grip, s, force, theta_dot_dot, growth, max(jolt, laws.LOADING_JOLT) if loading else jolt)
     x, P = motion(x, force, theta_dot_dot, growth), F @ P @ F.T + Q
     for scale in SCALE_LEFT, SCALE_RIGHT:
         P[scale, scale] = max(P[scale, scale], sample["doubt"] ** 2)
@@ -96,7 +98,7 @@ def textbook(s, sample, before, theta_dot_dot, loading):
     for k, wheel in enumerate((LEFT, RIGHT)):
         if grip[k]:
             e, R = sample["encoder"][k] - x[wheel], s["encoder_variance"]
-            P[wheel, wheel] = max(P[wheel, wheel], e**2 / laws.SLIPPED**2 - R)  # the slip is in the angle
+            P[wheel, wheel] = max(P[wheel, wheel], e**2 / laws.SLIP_SIGMAS**2 - R)  # the slip is in the angle
             x, P = joseph(x, P, np.array([e]), np.eye(N)[[wheel]], np.array([[R]]))
     gyro = np.eye(N)[[OMEGA]] + np.eye(N)[[BIAS]]
     return joseph(x, P, sample["gyro"] - gyro @ x, gyro, np.array([[s["gyro_variance"]]]))
@@ -114,7 +116,7 @@ def random_filter(seed, spread=1.0):
     s["encoder_variance"], s["gyro_variance"] = (2 * np.pi / 88_064) ** 2 / 12, 3e-3**2
     s["bias_walk"], s["acceleration_variance"], s["offset_walk"] = 2e-5, 0.016**2, 0.02
     s["fix_variance"], s["offset"] = (9e-6, 9e-6, 9e-6), 0.05
-    s["drift_bound"] = laws.DRIFTING / np.sqrt(2 * laws.FIXES - 1)
+    s["drift_bound"] = laws.DRIFT_SIGMAS / np.sqrt(2 * laws.INNOVATION_FIXES - 1)
     s["kept_tick"] = -1
     return s, rng
 
@@ -234,7 +236,7 @@ class Drive:
         self.sensors.command(self.tick, np.tile(self.twist((self.tick + 0.5) * T)[2:], (len(self.plant), 1)))
         for k in range(10):
             v, omega, _, _ = self.twist((self.tick + (k + 0.5) / 10) * T)
-            direction = self.state[2] + omega * T / 20 - laws.SIDE * omega
+            direction = self.state[2] + omega * T / 20 - laws.SIDE_SLIP_TIME * omega
             self.state = self.state + T / 10 * np.array([v * np.cos(direction), v * np.sin(direction), omega])
             self.angles = self.angles + T / 10 * np.array([v - HALF * omega, v + HALF * omega]) / RADIUS
         self.tick += 1
@@ -247,13 +249,13 @@ def test_another_radius(seed, difference, speed, calm):
     s, rng = random_filter(seed)
     s["inertial"] = speed
     sample = sample_of(s, rng)
-    sample["acceleration"], sample["doubt"] = (s["offset"] + (0.0 if calm else 1.01 * laws.CALM), 0), 0
-    counts = 2 * s["encoder_variance"] * (RADIUS / laws.AVERAGE) ** 2
-    turning = (2 * HALF) ** 2 * s["gyro_variance"] * T / (2 * laws.AVERAGE)
+    sample["acceleration"], sample["doubt"] = (s["offset"] + (0.0 if calm else 1.01 * laws.CALM_ACCELERATION), 0), 0
+    counts = 2 * s["encoder_variance"] * (RADIUS / laws.RADIUS_AVERAGE) ** 2
+    turning = (2 * HALF) ** 2 * s["gyro_variance"] * T / (2 * laws.RADIUS_AVERAGE)
     slope = np.zeros(N)  # of the difference by the state
     slope[[BIAS, SCALE_LEFT, SCALE_RIGHT]] = -2 * HALF, speed, -speed
-    band = 4 * np.sqrt(counts + turning + slope @ s["P"] @ slope) + laws.TWIST
-    means = difference * (1 - (1 - T / laws.AVERAGE) ** np.arange(1, 501))
+    band = 4 * np.sqrt(counts + turning + slope @ s["P"] @ slope) + laws.GRIP_DIFFERENCE
+    means = difference * (1 - (1 - T / laws.RADIUS_AVERAGE) ** np.arange(1, 501))
     expected = np.flatnonzero(abs(means) > band)[:1]
     found = None
     for n in range(500):
@@ -263,7 +265,9 @@ def test_another_radius(seed, difference, speed, calm):
             break
     assert (found is not None) == (calm and len(expected) > 0)
     if found is not None:
-        assert found == expected[0] and sample["doubt"] == pytest.approx(min(abs(means[found]) / speed, laws.DOUBT))
+        assert found == expected[0] and sample["doubt"] == pytest.approx(
+            min(abs(means[found]) / speed, laws.RADIUS_DOUBT)
+        )
         assert s["difference"] == 0
 
 
@@ -273,8 +277,8 @@ def test_drift(seed, along, turned):
     """Radii, bias and posture are doubted when a mean innovation, a decaying exponential, leaves its band."""
     s, _ = random_filter(seed)
     s["bias_variance"] = 2 * s["P"][BIAS, BIAS]
-    means = np.outer((along, turned), 1 - (1 - 1 / laws.FIXES) ** np.arange(1, 201))
-    expected = np.flatnonzero(abs(means).max(0) > laws.DRIFTING / np.sqrt(2 * laws.FIXES - 1))[:1]
+    means = np.outer((along, turned), 1 - (1 - 1 / laws.INNOVATION_FIXES) ** np.arange(1, 201))
+    expected = np.flatnonzero(abs(means).max(0) > laws.DRIFT_SIGMAS / np.sqrt(2 * laws.INNOVATION_FIXES - 1))[:1]
     before, found = s.copy(), None
     for n in range(200):
         laws.find_drift(along, turned, s)
@@ -290,7 +294,7 @@ def test_drift(seed, along, turned):
     raised = np.diag(s["P"] - before["P"]).copy()
     np.testing.assert_allclose(raised[:3], s["fix_variance"], rtol=1e-9)
     assert np.diag(s["P"])[[BIAS, SCALE_LEFT, SCALE_RIGHT]] == pytest.approx(
-        [2 * before["P"][BIAS, BIAS], *np.maximum(laws.DOUBT**2, np.diag(before["P"])[-2:])]
+        [2 * before["P"][BIAS, BIAS], *np.maximum(laws.RADIUS_DOUBT**2, np.diag(before["P"])[-2:])]
     )
     raised[[0, 1, 2, BIAS, SCALE_LEFT, SCALE_RIGHT]] = 0
     assert not raised.any() and np.array_equal(np.triu(s["P"], 1), np.triu(before["P"], 1))
@@ -308,7 +312,7 @@ def test_drift_along_the_heading(seed, heading, correlation):
     S = P[:3, :3] + np.diag(s["fix_variance"])
     e = 0.3 * np.linalg.cholesky(S) @ rng.normal(size=3)
     directions = np.array([[np.cos(heading), np.sin(heading), 0], [0, 0, 1]])
-    expected = [h @ e / np.sqrt(h @ S @ h) / laws.FIXES for h in directions]
+    expected = [h @ e / np.sqrt(h @ S @ h) / laws.INNOVATION_FIXES for h in directions]
     laws.absorb_fix(s["mean"][:3] + e, s)
     np.testing.assert_allclose(s["drift"], expected, rtol=1e-6, atol=1e-12)
 
@@ -325,7 +329,7 @@ def test_drift_of_innovations():
         if other["nis"] <= FIX_GATE:
             drift = other["drift"].copy()
             kept.append(drift)
-    variance = np.var(kept, axis=0) * (2 * laws.FIXES - 1)
+    variance = np.var(kept, axis=0) * (2 * laws.INNOVATION_FIXES - 1)
     assert variance == pytest.approx([1, 1], abs=0.2)
 
 
@@ -389,7 +393,7 @@ def test_outlier():
     where = s["mean"][:3].copy()
     fix = where + (0.4, -0.3, 0.1)
     before = s.copy()
-    for k in range(1, LOST):
+    for k in range(1, LOST_FIXES):
         laws.absorb_fix(fix, s)
         assert s["refused"] == k and s["nis"] > FIX_GATE
         assert np.array_equal(s["mean"], before["mean"]) and np.array_equal(s["P"], before["P"])
@@ -408,9 +412,9 @@ def test_one_good_fix_between_outliers():
     s, _ = random_filter(2)
     good, bad = s["mean"][:3].copy(), s["mean"][:3] + 0.5
     for _ in range(3):
-        for _ in range(LOST - 1):
+        for _ in range(LOST_FIXES - 1):
             laws.absorb_fix(bad, s)
-        assert s["refused"] == LOST - 1
+        assert s["refused"] == LOST_FIXES - 1
         laws.absorb_fix(good, s)
         assert s["refused"] == 0
     np.testing.assert_allclose(s["mean"][:3], good, atol=1e-12)

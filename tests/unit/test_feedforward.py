@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.control.features import NAMES, SIGN_SPEED, feature_matrix, feature_scale, linear
+from mrctl.control.features import FEATURE_NAMES, SIGN_SPEED, feature_matrix, feature_scale, linear
 from mrctl.control.feedforward import Loop, NoLearner, Prior
 from mrctl.kernel import over_rows
 from mrctl.theory import dynamics
@@ -27,7 +27,7 @@ def test_features(robot):
     found = feature_matrix(COMMANDS, DERIVATIVES, robot.half_track, scale) * scale
     expected = dynamics.regressor(COMMANDS, DERIVATIVES, robot, SIGN_SPEED)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    assert len(NAMES) == expected.shape[-1]
+    assert len(FEATURE_NAMES) == expected.shape[-1]
 
 
 def test_scales(robot):

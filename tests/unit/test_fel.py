@@ -30,7 +30,7 @@ from mrctl.control.fel import (
     update,
 )
 from mrctl.control.fel_torch import Network
-from mrctl.control.matching import LAG
+from mrctl.control.matching import HOLD_PERIODS
 from mrctl.control.weights import flatten, initial_weights, load_weights, save_weights, shapes, unflatten
 from mrctl.record import InputError
 
@@ -82,7 +82,7 @@ def taught(robot, settings=None, rigid=False, size=1):
     )
     command = RNG.uniform([-1.5, -3], [1.5, 3], (size, 2))
     derivative = RNG.uniform([-1.5, -6], [1.5, 6], (size, 2))
-    for _ in range(LAG):
+    for _ in range(HOLD_PERIODS):
         stage.output(command, derivative)
         teach(stage, np.ones((size, 2)))
     assert not stage.weight_norm.any()
@@ -171,7 +171,7 @@ def test_learns(robot):
     """Taught by what was missing to an inverse two periods ago, the network finds it."""
     stage = FeedbackErrorLearning(Loop(robot, False, PERIOD, seeds=list(range(8))), [Fel(step=0.2, dead_zone=0.0)] * 8)
     gains = np.array([[6.0, 1.0, 3.0, 0.5, -1.0, 0.4, 1.0, 1.0], [0.2, 5.0, 0.1, 4.0, 2.0, 0.0, -1.0, 1.0]]).T
-    rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * LAG
+    rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * HOLD_PERIODS
     for _ in range(600):
         command, derivative = rng.uniform([0.2, -2], [1.2, 2], (8, 2)), rng.uniform([-1, -4], [1, 4], (8, 2))
         given = stage.output(command, derivative)
@@ -260,7 +260,7 @@ def test_rows(robot, motion, feedback, data):
         command, derivative = motion[:, rows].copy()
         command[list(lost)] = np.nan
         stage = FeedbackErrorLearning(Loop(robot, False, PERIOD, seeds=[0] * len(command)), [settings] * len(command))
-        for _ in range(LAG):
+        for _ in range(HOLD_PERIODS):
             stage.output(command, derivative)
             teach(stage, feedback[rows])
         stage.initial[:], stage.weights[:] = prior[rows], prior[rows] + 0.01

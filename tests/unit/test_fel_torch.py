@@ -8,7 +8,7 @@ from torch import nn
 from mrctl.control.feedforward import Loop
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning, Network
-from mrctl.control.matching import LAG
+from mrctl.control.matching import HOLD_PERIODS
 from mrctl.control.weights import flatten, initial_weights, unflatten
 
 HIDDEN, SIZE, PERIOD = 5, 3, 0.01
@@ -92,7 +92,7 @@ def test_any_module(robot):
     module = nn.Sequential(nn.Linear(8, 16), nn.GELU(), nn.Linear(16, 16), nn.GELU(), nn.Linear(16, 2))
     before = {name: value.clone() for name, value in module.state_dict().items()}
     stage = ModuleLearning(module, robot, 8, Fel(step=0.3, dead_zone=0.0, weight_bound=100.0))
-    rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * LAG
+    rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * HOLD_PERIODS
     for tick in range(700):
         command, derivative = draw(rng, 8)
         given = stage.output(command, derivative)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl import Event, Line, Scenario, simulate
-from mrctl.loop.goals import HEADWAY, NEAR, RESTING, STUCK, TURNED, Goals, arrived
+from mrctl.loop.goals import ARRIVAL_ANGLE, ARRIVAL_DISTANCE, ARRIVAL_SPEED, STUCK_DISTANCE, STUCK_TIME, Goals, arrived
 from mrctl.results.dataset import TICK
 
 GOAL = (0.3, -0.2, 3.1)
@@ -15,7 +15,7 @@ SIZE = 40
 def judged(tick, now, goals, memory, ticks, patience):
     """The formulas on arrays; `memory` is where and when each robot last made headway."""
     x, y, (place, since) = now["x"], now["y"], memory
-    farther = np.hypot(x - place[:, 0], y - place[:, 1]) > HEADWAY
+    farther = np.hypot(x - place[:, 0], y - place[:, 1]) > STUCK_DISTANCE
     place[farther, 0], place[farther, 1], since[farther] = x[farther], y[farther], tick
     over = arrived(np.stack([x, y, now["theta"]], -1), now["v"], goals) | (tick + 1 >= ticks)
     stuck = np.isfinite(x + goals[:, 0]) & (tick - since >= patience)
@@ -30,18 +30,18 @@ def test_ends(timed):
     goals = np.array([s.goal or (np.nan,) * 3 for s in scenarios])
     length = np.array([s.ticks for s in scenarios])
     ticks = np.where(timed & (length < length.max()), length, np.inf)
-    group, patience = Goals(scenarios, timed), round(STUCK / TASK.control_period)
+    group, patience = Goals(scenarios, timed), round(STUCK_TIME / TASK.control_period)
     memory = np.full((SIZE, 2), np.inf), np.zeros(SIZE, int)
     now, found = np.zeros(SIZE, TICK), []
     for tick in range(700):
         moves = np.arange(SIZE) % 4 != 0  # the others stand still, away from their goals
-        away = NEAR * random.uniform(0.99, 1.01, SIZE) * random.choice([1, 30], SIZE, p=[0.5, 0.5])
+        away = ARRIVAL_DISTANCE * random.uniform(0.99, 1.01, SIZE) * random.choice([1, 30], SIZE, p=[0.5, 0.5])
         angle = random.uniform(-4, 4, SIZE)
         now["x"] = np.where(moves, GOAL[0] + away * np.cos(angle), 2.0)
         now["y"] = np.where(moves, GOAL[1] + away * np.sin(angle), 2.0)
-        turn = TURNED * random.choice([-1, 1], SIZE) * random.choice([0.5, 1, 1 + 1e-15, 1 - 1e-15, 1.5], SIZE)
+        turn = ARRIVAL_ANGLE * random.choice([-1, 1], SIZE) * random.choice([0.5, 1, 1 + 1e-15, 1 - 1e-15, 1.5], SIZE)
         now["theta"] = GOAL[2] + turn + 2 * np.pi * random.integers(-3, 4, SIZE)
-        now["v"] = RESTING * random.choice([-0.9, 0, 0.9, 1, 1.1], SIZE)
+        now["v"] = ARRIVAL_SPEED * random.choice([-0.9, 0, 0.9, 1, 1.1], SIZE)
         for name in ("x", "y", "theta", "v"):
             now[name][tick % 5 == np.arange(SIZE) % 11] = np.nan
         there = arrived(np.stack([now["x"], now["y"], now["theta"]], -1), now["v"], goals)

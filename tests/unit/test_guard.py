@@ -17,7 +17,7 @@ from mrctl.control.fel_torch import ModuleLearning
 from mrctl.control.guard import GUARD_ACTIONS, REASONS, Guard, fresh, guard
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.nominal import NOMINAL
-from mrctl.control.oscillation import DRIFT, SMOOTH
+from mrctl.control.oscillation import DRIFT_FILTER, NOISE_FILTER
 from mrctl.control.pid import Pid
 from mrctl.control.rejection import LinearLoop
 from mrctl.control.rls import RecursiveLeastSquares, Rls
@@ -79,7 +79,7 @@ def sine(amplitude, frequency, duration=20.0):
 def passed(frequency):
     """Gain of the guard's band-pass, as designed in continuous time."""
     s = 2j * np.pi * frequency
-    return abs(s * DRIFT / (1 + s * DRIFT) / (1 + s * SMOOTH))
+    return abs(s * DRIFT_FILTER / (1 + s * DRIFT_FILTER) / (1 + s * NOISE_FILTER))
 
 
 small = st.floats(-5, 5)
@@ -198,7 +198,7 @@ def test_forgotten(robot, channel):
     for after in (1, 2, 4, 8, 15):
         number = np.arange(before + after)
         step = toeplitz(pulse[held - 1 :: held][: len(number)], np.zeros(len(number)))
-        bound = within * (1 + PERIOD / module.RECENT) ** (held * np.maximum(before - 1 - number, 0))
+        bound = within * (1 + PERIOD / module.PEAK_DECAY) ** (held * np.maximum(before - 1 - number, 0))
         ends = np.minimum(bound, SUPPLY)[:, None] * (-1, 1)
         rows = np.vstack([step[:before], -step[:before]])
         found = linprog(-step[-1], rows, np.full(2 * before, 0.98 * region), bounds=ends, method="highs")
@@ -214,7 +214,7 @@ def test_position_bounds_the_deviation():
     """Where the posture is the weaker, its bound follows from it: both channels at once reach 0.15 m."""
     g = Bench(gains=((0.001, 0.05), (0.5, 0.01))).g
     found = g["harmless_to_posture"]
-    assert found[0] * 0.05 == pytest.approx(module.TOLERATED / np.sqrt(2)) and found[0] < g["harmless"][0]
+    assert found[0] * 0.05 == pytest.approx(module.TOLERATED_POSTURE / np.sqrt(2)) and found[0] < g["harmless"][0]
     assert found[1] == g["harmless"][1] == pytest.approx(g["region"][1] / 0.5)
 
 

@@ -14,7 +14,7 @@ from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop.courses import GOAL
-from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy
+from mrctl.loop.hierarchy import HAND_OVER_SHARE, Hierarchy
 from mrctl.loop.user_hierarchy import UserHierarchy
 from mrctl.loop.user_stages import UserStage
 from mrctl.record import InputError
@@ -298,7 +298,7 @@ def test_take_over(robot):
         hierarchy = UserHierarchy([Scenario(learner="none")], robot, {"feedforward": stage})
         tick(hierarchy, np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]))
         integrals.append(hierarchy.state["pid"]["integral"].copy())
-    np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * taken, atol=1e-14)
+    np.testing.assert_allclose(integrals[1] - integrals[0], HAND_OVER_SHARE * taken, atol=1e-14)
 
 
 def test_lag_of_the_fork(robot):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl.experiments import identify
-from mrctl.experiments.identify import TICK, Drive, derivative, drive_constants, lines, signals, turn_constants
+from mrctl.experiments.identify import HOLD_TIME, Drive, derivative, drive_constants, lines, signals, turn_constants
 from mrctl.theory.robot import Robot
 
 
@@ -25,10 +25,10 @@ def integrate(robot: Robot, volts, start):
     out = [state.T]
     for left, right in np.moveaxis(volts, -1, 1):
         k1 = rate(state, left, right)
-        k2 = rate(state + TICK / 2 * k1, left, right)
-        k3 = rate(state + TICK / 2 * k2, left, right)
-        k4 = rate(state + TICK * k3, left, right)
-        state = state + TICK / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        k2 = rate(state + HOLD_TIME / 2 * k1, left, right)
+        k3 = rate(state + HOLD_TIME / 2 * k2, left, right)
+        k4 = rate(state + HOLD_TIME * k3, left, right)
+        state = state + HOLD_TIME / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         out.append(state.T)
     return np.array(out)
 
@@ -47,7 +47,7 @@ def drives(robot, count, random, turns, quantum=0.0, noise=0.0):
     encoders = both(robot, way, heading).swapaxes(0, 1)
     if quantum:
         encoders = quantum * np.floor(encoders / quantum + random.random((count, 2)))
-    time = TICK * np.arange(1, len(volts) + 1)
+    time = HOLD_TIME * np.arange(1, len(volts) + 1)
     gyro = omega.T + noise * (random.standard_normal(omega.T.shape) + 0.1 * time[:, None])
     whole, highest = len(volts) // 2, 2 * round(identify._bandwidth(robot) * identify.PERIOD)
     seen = [lines(time[whole:], signal[whole:], highest) for signal in (encoders, gyro, volts, current)]
@@ -91,7 +91,7 @@ def test_average_and_product():
     def at(of, time):
         return of[0].real + 2 * (of[1:, None] * np.exp(1j * np.outer(identify.frequencies(6)[1:], time))).real.sum(0)
 
-    fine = 3.0 - TICK + TICK * (np.arange(1000) + 0.5) / 1000
+    fine = 3.0 - HOLD_TIME + HOLD_TIME * (np.arange(1000) + 0.5) / 1000
     assert at(identify.average(first), 3.0)[0] == pytest.approx(at(first, fine).mean(), rel=1e-6)
     time = identify.PERIOD * np.arange(40) / 40
     expected = np.fft.rfft(at(first, time) * at(second, time))[:6] / 40
@@ -160,7 +160,7 @@ def test_signals(robot):
         volts = np.tile(np.stack([common - differential, common + differential], -1), (2, 1, 1))
         path = integrate(robot, volts, np.tile([robot.max_speed / 2, 0.0], (3, 1)))[len(period) :]
         v, omega = path[..., 0], path[..., 1]
-        v_dot, omega_dot = (np.diff(one, axis=0) / TICK for one in (v, omega))
+        v_dot, omega_dot = (np.diff(one, axis=0) / HOLD_TIME for one in (v, omega))
         assert v.min() > robot.half_track * np.abs(omega).max() and v.max() < robot.max_speed
         assert np.abs(v_dot).max() < robot.max_acceleration
         assert np.abs(omega_dot).max() < robot.max_rotation_acceleration

@@ -6,7 +6,7 @@ from test_obstacles import random_shapes
 
 from mrctl import Box, Disc, Obstacles
 from mrctl.sensing.lidar import Lidar
-from mrctl.sensing.particles import LEAST, MOST, Particles, is_free
+from mrctl.sensing.particles import MAX_PARTICLES, MIN_PARTICLES, Particles, is_free
 from mrctl.sensing.scan_matching import match
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import at, field_of
@@ -181,12 +181,12 @@ def test_unknown_start():
     room = Room(3)
     drive = [(pose, way, turn, room.seen(pose)) for pose, way, turn in room.drive(25)]
     filters = [Particles(room.field, seed, None) for seed in (0, 0, 1)]
-    assert len(filters[0].particles) == MOST
+    assert len(filters[0].particles) == MAX_PARTICLES
     for _, way, turn, scanned in drive:
         same, again, other = (f.update(way, turn, *scanned).copy() for f in filters)
         assert np.array_equal(same, again)
     assert not np.array_equal(same, other)
-    assert errors(same, drive[-1][0])[0] < 0.05 and len(filters[0].particles) < 2 * LEAST
+    assert errors(same, drive[-1][0])[0] < 0.05 and len(filters[0].particles) < 2 * MIN_PARTICLES
 
 
 def test_rays():

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from mrctl.results.dataset import TICK
 from mrctl.viewer.deviation import drawn, extent
-from mrctl.viewer.sensors import SHARE, SIGMAS, ellipse, magnification
+from mrctl.viewer.sensors import ELLIPSE_SHARE, SIGMAS, ellipse, magnification
 
 SPREAD = st.floats(1e-4, 1.0)
 
@@ -31,7 +31,7 @@ def test_ellipse(first, second, correlation, turn):
 
 def test_share():
     """The share of estimates within the ellipse that the page states."""
-    assert chi2(2).cdf(SIGMAS**2) == pytest.approx(SHARE) == pytest.approx(0.989, abs=5e-4)
+    assert chi2(2).cdf(SIGMAS**2) == pytest.approx(ELLIPSE_SHARE) == pytest.approx(0.989, abs=5e-4)
 
 
 def test_magnification():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from mrctl.control.design import plants
 from mrctl.control.margins import sampled_loop
-from mrctl.control.matching import LAG, histories, recall
+from mrctl.control.matching import HOLD_PERIODS, histories, recall
 from mrctl.control.pid import Pid
 
 PERIOD = 0.01
@@ -22,9 +22,9 @@ def test_recall(delay, ticks, width):
         x = np.random.default_rng(tick).normal(size=width)
         answered = recall(x, queue, s)
         given_before.append(x)
-        assert answered == (tick >= delay + LAG)
+        assert answered == (tick >= delay + HOLD_PERIODS)
         if answered:
-            np.testing.assert_array_equal(s["past"], given_before[tick - delay - LAG])
+            np.testing.assert_array_equal(s["past"], given_before[tick - delay - HOLD_PERIODS])
 
 
 @pytest.mark.parametrize("delay", [1, 2], ids=["lab", "field"])
@@ -46,6 +46,6 @@ def test_phase(robot, channel, delay):
     bare, size = wrong(2.0, 0)
     peak = frequency[size.argmax()]
     assert size.max() > 1.9 and bare[np.abs(frequency - peak) < 1].all()
-    matched, _ = wrong(2.0, delay + LAG)
+    matched, _ = wrong(2.0, delay + HOLD_PERIODS)
     assert not matched[frequency < 1.25 * peak].any()
-    assert not wrong(1.0, delay + LAG)[0][frequency < 0.75 * peak].any()  # the nominal robot has no resonance
+    assert not wrong(1.0, delay + HOLD_PERIODS)[0][frequency < 0.75 * peak].any()  # the nominal robot has no resonance

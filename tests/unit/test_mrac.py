@@ -7,7 +7,7 @@ import pytest
 
 from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.control.feedforward import Loop, Prior
-from mrctl.control.matching import SETTLED
+from mrctl.control.matching import SETTLING_TIMES
 from mrctl.control.mrac import MRAC, ModelReferenceAdaptive, Mrac, confine, predict, project, track
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
 
@@ -81,7 +81,7 @@ def drive(robot, settings, period, seconds, known=True, turns=False):
         error = wanted - x
         voltage = K_P * error + K_I * integral
         voltage = voltage + prior.output(wanted[None], rate[None])[0] + stage.output(wanted[None], rate[None])[0]
-        if stage.rows["age"][0] > SETTLED:
+        if stage.rows["age"][0] > SETTLING_TIMES:
             log.append(lyapunov(stage, prior, true, error, integral, period))
         stage.prior = prior
         added = stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None])

@@ -37,13 +37,16 @@ def drivable(where, found, start, goal, reverse):
     steps, turns = np.diff(found.poses[:, :2], axis=0), np.diff(found.poses[:, 2])
     turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
     length = np.hypot(*steps.T)
-    assert length.max() < hybrid_astar.CHECK + 1e-9
+    assert length.max() < hybrid_astar.CHECK_SPACING + 1e-9
     assert np.all(np.abs(turns) <= length / RADIUS * 1.01 + 1e-9)
     middle = found.poses[:-1, 2] + turns / 2
     ahead = np.sum(steps * np.column_stack([np.cos(middle), np.sin(middle)]), axis=1)
     assert np.allclose(ahead, length * found.directions[1:], atol=1e-6)
     switches = np.sum(np.diff(found.directions[1:]) != 0)
-    cost = np.sum(length * np.where(found.directions[1:] < 0, hybrid_astar.REVERSE, 1)) + hybrid_astar.SWITCH * switches
+    cost = (
+        np.sum(length * np.where(found.directions[1:] < 0, hybrid_astar.REVERSE_COST, 1))
+        + hybrid_astar.SWITCH_COST * switches
+    )
     assert cost == pytest.approx(found.cost, rel=0.01)
 
 
@@ -162,7 +165,7 @@ def rrt_star(where, start, goal, reverse, size, most):
     bounds.setLow(-size)
     bounds.setHigh(size)
     poses_of.setBounds(bounds)
-    poses_of.setLongestValidSegmentFraction(hybrid_astar.CHECK / poses_of.getMaximumExtent())
+    poses_of.setLongestValidSegmentFraction(hybrid_astar.CHECK_SPACING / poses_of.getMaximumExtent())
 
     def free(state):
         pose[:] = state.getX(), state.getY(), state.getYaw()
@@ -195,7 +198,7 @@ def costs(where, poses, reverse):
     cost, length, last = 0.0, 0.0, 0.0
     for start, goal in pairwise(poses):
         curve = steer(start, goal, RADIUS, reverse)
-        passed, _ = sample(start, curve, RADIUS, hybrid_astar.CHECK)
+        passed, _ = sample(start, curve, RADIUS, hybrid_astar.CHECK_SPACING)
         inside = all(hybrid_astar.cell_of.compiled(pose, where)[0] >= 0 for pose in passed)
         if not inside or min(clearance(FOOTPRINT, pose, where.outlines) for pose in passed) < where.margin - 0.01:
             return None
@@ -302,7 +305,7 @@ def test_run_out(curvature):
         middle = pose[2] + curvature * length / 20_000
         pose = pose + length / 10_000 * np.array([np.cos(middle), np.sin(middle), curvature])
     assert np.allclose(arc[0], (1.0, -2.0, 0.5)) and np.allclose(arc[-1], pose, atol=1e-6)
-    assert np.hypot(*np.diff(arc[:, :2], axis=0).T).max() <= hybrid_astar.CHECK
+    assert np.hypot(*np.diff(arc[:, :2], axis=0).T).max() <= hybrid_astar.CHECK_SPACING
     way = hybrid_astar.Plan(arc, np.append(0.0, np.ones(len(arc) - 1)), length, 0)
     course = way.reference(0.7, limits, velocity=0.7, curvature=curvature)
     assert course.sample(np.zeros(1)).twist[0] == pytest.approx([0.7, 0.7 * curvature], rel=0.1, abs=1e-9)
@@ -323,7 +326,7 @@ def test_begins_as_the_robot_drives(twist, goal):
     assert np.allclose(motion.pose[0], task.start, atol=6e-3)
     assert v < 1.0001 * twist[0] and omega / v == pytest.approx(twist[1] / twist[0], abs=0.02)
     assert np.allclose(found.poses[0], task.start) and found.directions[0] == 0 and np.all(found.directions[1:] == 1)
-    assert np.hypot(*np.diff(found.poses[:, :2], axis=0).T).max() < hybrid_astar.CHECK + 1e-9
+    assert np.hypot(*np.diff(found.poses[:, :2], axis=0).T).max() < hybrid_astar.CHECK_SPACING + 1e-9
     if (goal, twist) == ((3, 0.5, 0), (0.7, 0.8)) and v <= 0.75 * twist[0]:
         pytest.xfail("it begins with 0.742 of the robot's speed, before 0.30.0 with 0.753")
     assert v > 0.75 * twist[0]

@@ -329,7 +329,7 @@ CUSPS = {
 @pytest.mark.parametrize("cusps", [(2, 4), (0, 2, 4)])
 def test_cusps(cusps: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """At each cusp the robot rests and changes its direction; twist and acceleration are derivatives of the pose."""
-    monkeypatch.setattr("mrctl.theory.references.KINK", 1.0)  # these points were not made with care
+    monkeypatch.setattr("mrctl.theory.references.MAX_CUSP_KINK", 1.0)  # these points were not made with care
     reference = Waypoints(**CUSPS, cusps=cusps)
     t = np.linspace(0, reference.period, 20_001)
     pose, twist, acceleration = reference.sample(t)
@@ -380,7 +380,7 @@ def test_start_of_a_turning_robot(curvature: float, monkeypatch: pytest.MonkeyPa
     assert np.allclose(pose, 0, atol=1e-3) and v == pytest.approx(0.5) and omega == pytest.approx(0.5 * curvature, 2e-3)
     near = course.sample(np.linspace(0, 0.6, 50))
     assert np.allclose(near.twist[:, 1] / near.twist[:, 0], curvature, atol=0.06 * abs(curvature))
-    monkeypatch.setattr("mrctl.theory.references.KINK", 1.0)
+    monkeypatch.setattr("mrctl.theory.references.MAX_CUSP_KINK", 1.0)
     turning = Waypoints.from_dict(CUSPS | {"cusps": (2, 4), "start_speed": 0.3, "start_curvature": 0.01})
     (first, _), *others = turning._parts
     assert (first.start_speed, first.start_curvature) == (0.3, 0.01)

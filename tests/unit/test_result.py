@@ -16,7 +16,7 @@ from mrctl.control.design import motion
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError
-from mrctl.results.dataset import GAINS, SIGNALS, open_result, save, scenarios_of, versions
+from mrctl.results.dataset import GAIN_VARIABLES, SIGNALS, open_result, save, scenarios_of, versions
 from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.recording import Library
 
@@ -72,11 +72,11 @@ def test_gains(result):
         around = motion(*design, both, delay)
         expected = {"k_p": gains["k_p"], "k_i": gains["k_i"], "prefilter": around.prefilter}
         expected |= {name: getattr(around.kanayama, name) for name in ("k_x", "k_y", "k_theta")}
-        assert set(expected) == set(GAINS)
+        assert set(expected) == set(GAIN_VARIABLES)
         for name, value in expected.items():
             found = result[name].isel(run=run)
             assert found.values.tolist() == np.array(value).tolist(), (run, name)
-            assert (found.attrs["units"], found.attrs["long_name"]) == GAINS[name]
+            assert (found.attrs["units"], found.attrs["long_name"]) == GAIN_VARIABLES[name]
     assert len(np.unique(result.k_p.values, axis=0)) == 3  # three delays or arrangements
     assert result.k_i.dims == ("run", "channel")
     given = Scenario(reference=CIRCLE, laps=1, pid={"time_constant": 0.2}, kanayama={"k_x": 3.0}, prefilter=0.05)

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.control.feedforward import Loop, Prior
-from mrctl.control.matching import LAG
+from mrctl.control.matching import HOLD_PERIODS
 from mrctl.control.rls import RLS, RecursiveLeastSquares, Rls, update
 from mrctl.theory.dynamics import inverse_coefficients
 
@@ -41,7 +41,7 @@ def learn(stage, feedback, saturated=0.0):
 
 def drive(stage, command, derivative):
     """The stage after it has driven one motion for as long as feedback takes to answer."""
-    for _ in range(LAG):
+    for _ in range(HOLD_PERIODS):
         stage.output(command, derivative)
         learn(stage, np.ones_like(command))
     assert not stage.weight_norm.any()
@@ -80,7 +80,7 @@ def test_learns_physics(robot):
     for _ in range(200):
         driven.append(draw(2))
         pupil.output(*driven[-1])
-        answered = driven[-LAG - 1] if len(driven) > LAG else driven[0]
+        answered = driven[-HOLD_PERIODS - 1] if len(driven) > HOLD_PERIODS else driven[0]
         x = feature_matrix(*answered, robot.half_track, scale)
         missing = teacher.output(*answered) - np.einsum("bi,bik->bk", x, pupil.rows["theta"])
         first = np.abs(missing).max() if first is None else first

@@ -12,9 +12,9 @@ from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, 
 from mrctl.control.feedforward import Loop, NoLearner
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError, is_whole
-from mrctl.scenario import LONGEST, replicates
+from mrctl.scenario import MAX_TICKS, replicates
 from mrctl.sensing.tiers import Sensing
-from mrctl.theory.perturbation import UNKNOWN
+from mrctl.theory.perturbation import REPLICATE_HALF_WIDTHS
 from mrctl.theory.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 
 values = (
@@ -65,7 +65,7 @@ def test_nonsense(path, value):
         expected = ".".join(path).replace("events.", "events.0.")
         assert message.startswith((expected, *(fields.get(name, ())), "laps")), message
     else:
-        assert 1 <= scenario.ticks <= LONGEST
+        assert 1 <= scenario.ticks <= MAX_TICKS
         assert Scenario.from_dict(json.loads(scenario.model_dump_json())) == scenario
 
 
@@ -338,7 +338,7 @@ def test_replicates():
     """Draws of what nobody knows are uniform, paired over scenarios, and those of a run's start in its events."""
     heavy = Scenario(perturbation=Perturbation(mass_factor=1.5), events=(Event(time=1, perturbation=Perturbation()),))
     runs, plain = replicates(heavy, 400), replicates(Scenario(learner="none"), 400)
-    for name, width in UNKNOWN.items():
+    for name, width in REPLICATE_HALF_WIDTHS.items():
         start, later, other = (
             np.array([getattr(p, name) for p in found])
             for found in (
@@ -352,5 +352,5 @@ def test_replicates():
         assert np.abs(other - 1).max() <= width
         assert other.std() == pytest.approx(width / np.sqrt(3), rel=0.1) and abs(other.mean() - 1) < 0.2 * width
     assert [r.seed for r in runs] == list(range(400)) and replicates(heavy, 3, first=7) == runs[7:10]
-    factors = np.array([[getattr(r.perturbation, name) for name in UNKNOWN] for r in plain])
-    assert np.abs(np.corrcoef(factors.T) - np.eye(len(UNKNOWN))).max() < 0.15
+    factors = np.array([[getattr(r.perturbation, name) for name in REPLICATE_HALF_WIDTHS] for r in plain])
+    assert np.abs(np.corrcoef(factors.T) - np.eye(len(REPLICATE_HALF_WIDTHS))).max() < 0.15

@@ -10,7 +10,7 @@ from mjviser.conversions import merge_geoms
 
 from mrctl.physics import mjcf
 from mrctl.theory.robot import CAR, RobotFile
-from mrctl.viewer.robots import SEEN, _rough
+from mrctl.viewer.robots import LAST_VISIBLE_GROUP, _rough
 from mrctl.viewer.shapes import ribbons
 
 
@@ -47,7 +47,7 @@ def test_ghosts(robot, steering):
     for body in bodies:
         geoms = [
             g for g in range(model.ngeom)
-            if model.geom_bodyid[g] == body and model.geom_group[g] <= SEEN and model.geom_rgba[g, 3] > 0
+            if model.geom_bodyid[g] == body and model.geom_group[g] <= LAST_VISIBLE_GROUP and model.geom_rgba[g, 3] > 0
         ]  # fmt: skip
         if geoms:
             fine, rough = merge_geoms(model, geoms), _rough(model, geoms)

@@ -10,7 +10,7 @@ from mrctl import Circle, Perturbation, Scenario, simulate
 from mrctl.physics import mjcf
 from mrctl.physics.files import models_folder
 from mrctl.physics.plant import PLANT, BatchPlant, PhysicsPlant
-from mrctl.sensing.sensors import OUTLIER, SAMPLE, Sensors
+from mrctl.sensing.sensors import MAX_OUTLIER, SAMPLE, Sensors
 from mrctl.sensing.slip import SLIP_FILTER, slip_ratio
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.robot import CAR, RobotFile
@@ -256,8 +256,8 @@ def test_fixes():
     np.testing.assert_allclose(error[~wrong].mean(0), 0, atol=3e-4)
     assert np.abs(np.corrcoef(error[~wrong].T) - np.eye(3)).max() < 0.02
     outliers = error[wrong][:, :2]
-    assert np.abs(outliers).max() < OUTLIER + 0.05
-    np.testing.assert_allclose(outliers.std(0), OUTLIER / np.sqrt(3), rtol=0.03)
+    assert np.abs(outliers).max() < MAX_OUTLIER + 0.05
+    np.testing.assert_allclose(outliers.std(0), MAX_OUTLIER / np.sqrt(3), rtol=0.03)
     assert error[wrong][:, 2].std() == pytest.approx(0.02, rel=0.03)
     lost = ~found["fix_arrives"]
     assert abs(np.corrcoef(lost.ravel(), wrong.ravel())[0, 1]) < 0.02

@@ -5,8 +5,8 @@ import pytest
 import shapely
 
 from mrctl import Box, Disc, Line, Obstacles, Scenario
-from mrctl.navigation.chart import RADIUS, through
-from mrctl.navigation.sight import SPACING, Sight
+from mrctl.navigation.chart import PLACE_RADIUS, through
+from mrctl.navigation.sight import DISC_SPACING, Sight
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.rays import Scan
@@ -55,7 +55,7 @@ def test_what_the_map_lacks_is_found(shape: Disc | Box, outline: shapely.Polygon
     ranges = exact.scan(np.zeros(3), Surroundings(Obstacles(shapes=(shape,))).at(0.0), np.random.default_rng(0))
     met = exact.points(ranges)
     gaps = np.hypot(*(met[:, None] - found[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
-    assert gaps.max() < SPACING + 3 * LIDAR.noise
+    assert gaps.max() < DISC_SPACING + 3 * LIDAR.noise
     assert len(sight.outlines(0.0).discs) == len(found) and not len(sight.moving(0.0).discs)
 
 
@@ -145,8 +145,8 @@ def test_end_of_range_moves() -> None:
         ranges = short.scan(pose, Surroundings(wall).at(0.0), np.random.default_rng(k))
         sight.see(Scan(ranges, short.angles, short.range, pose, 0.1 * k))
     along = np.sort(discs(sight, 0.0)[:, 0])
-    assert along[0] < -2.0 and along[-1] > 4.0 and np.diff(along).max() < 3 * SPACING
-    assert len(along) < 2 * np.ptp(along) / SPACING
+    assert along[0] < -2.0 and along[-1] > 4.0 and np.diff(along).max() < 3 * DISC_SPACING
+    assert len(along) < 2 * np.ptp(along) / DISC_SPACING
 
 
 def test_end_of_range_stays() -> None:
@@ -156,7 +156,7 @@ def test_end_of_range_stays() -> None:
         ranges = short.scan(np.zeros(3), Surroundings(wall).at(0.0), np.random.default_rng(k))
         sight.see(Scan(ranges, short.angles, short.range, np.zeros(3), 0.1 * k))
     found = discs(sight, 0.0)
-    assert len(found) < 2 * np.ptp(found[:, 0]) / SPACING
+    assert len(found) < 2 * np.ptp(found[:, 0]) / DISC_SPACING
 
 
 def test_shadow_moves() -> None:
@@ -167,8 +167,8 @@ def test_shadow_moves() -> None:
         scanned(sight, Obstacles(shapes=(wall, post)), np.array([x, 0.0, 0.0]), 0.1 * k)
         found = discs(sight, 0.1 * k)
         along = np.sort(found[found[:, 1] > 2.0, 0])
-        assert k == 0 or (along[0] < -1.6 and along[-1] > 1.6 and np.diff(along).max() < 3 * SPACING)
-    assert len(along) < 2 * np.ptp(along) / SPACING
+        assert k == 0 or (along[0] < -1.6 and along[-1] > 1.6 and np.diff(along).max() < 3 * DISC_SPACING)
+    assert len(along) < 2 * np.ptp(along) / DISC_SPACING
 
 
 def test_seen_through() -> None:
@@ -183,8 +183,8 @@ def test_seen_through() -> None:
     for point, clear in zip(points, seen, strict=True):
         away = np.hypot(*point)
         behind = point * (1 + (0.1 + 0.02 * away) / away)
-        swept = shapely.LineString([(0, 0), behind]).buffer(RADIUS, cap_style="flat")
-        narrow = shapely.LineString([(0, 0), behind]).buffer(0.2 * RADIUS, cap_style="flat")
+        swept = shapely.LineString([(0, 0), behind]).buffer(PLACE_RADIUS, cap_style="flat")
+        narrow = shapely.LineString([(0, 0), behind]).buffer(0.2 * PLACE_RADIUS, cap_style="flat")
         if np.hypot(*behind) > 4.0:  # beyond the largest range
             assert not clear
         elif not swept.buffer(0.05).intersects(shape):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.nominal import nominal
-from mrctl.control.steering import ALLOCATION, REST, allocate, steer, take_loss
+from mrctl.control.steering import ALLOCATION, HOLD_SPEED, allocate, steer, take_loss
 from mrctl.kernel import over_rows
 from mrctl.theory import kinematics
 from mrctl.theory.dynamics import common_differential, inverse_dynamics, left_right
@@ -105,7 +105,7 @@ def test_rigid(stiff, twist, acceleration):
     """Without trail the angle is atan(L θ̇/V) at once, forwards and in reverse, and its rate the derivative."""
     v, omega = twist
     angle = kinematics.steering_angle(twist, stiff)
-    assume(np.hypot(v, 0.4 * omega) > 2 * REST and abs(angle) < stiff.steering_limit - 1e-3)
+    assume(np.hypot(v, 0.4 * omega) > 2 * HOLD_SPEED and abs(angle) < stiff.steering_limit - 1e-3)
     allocation = Allocation(stiff, rigid=True, angle=0.7)
     _, _, command, rate = allocation(twist, acceleration)
     h = 1e-6
@@ -123,7 +123,7 @@ def test_stop_and_go(stiff):
 
 
 @pytest.mark.parametrize("rigid", [False, True])
-@given(twist=numbers(2, 0.9 * REST), acceleration=numbers(2, 3.0), angle=st.floats(-1, 1))
+@given(twist=numbers(2, 0.9 * HOLD_SPEED), acceleration=numbers(2, 3.0), angle=st.floats(-1, 1))
 def test_rest(robot, rigid, twist, acceleration, angle):
     """At rest the fork holds its angle."""
     command = Allocation(robot, rigid, angle=angle)(twist, acceleration)

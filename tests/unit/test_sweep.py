@@ -257,7 +257,7 @@ def test_many_values_are_checked_fast(capsys, monkeypatch):
     one = calls(Scenario.from_dict, base)
     assert calls(sweep, axis(MASS["field"], values=np.linspace(1, 2, 500).tolist())) < 2 * 500 * one
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(plan, "QUIET", 0.0)
+    monkeypatch.setattr(plan, "QUIET_TIME", 0.0)
     sweep(axis(MASS["field"], values=[1, 2]))
     assert "checks the values" in capsys.readouterr().err
 
