@@ -199,6 +199,10 @@ class Scenario(Record):
         """
         return self.replace(events=(*self.events, event))
 
+    def with_feedforward(self, name: FeedforwardName) -> Scenario:
+        """Returns the scenario without its label and with another feedforward, which starts without `learned`."""
+        return self.model_copy(update=FEEDFORWARDS[name] | {"name": "", "learned": None})
+
     @property
     def known(self) -> Obstacles:
         """Obstacles on the map."""

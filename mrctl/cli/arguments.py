@@ -47,7 +47,7 @@ def expanded(arguments: list[str]) -> list[str]:
                     "perturbation: needs a name, such as all, or a flag such as --perturbation.mass-factor"
                 )
             perturbation = Perturbation.from_dict(name, "perturbation")
-            for field, changed in perturbation.model_dump(exclude_defaults=True).items():
+            for field, changed in perturbation.model_dump().items():  # all, for it replaces that of a scenario file
                 found += [f"--perturbation.{field.replace('_', '-')}", str(changed)]
         elif flag in SHORT_FLAGS:
             if not (name := value if given else next(rest, "")) or name.startswith("--"):

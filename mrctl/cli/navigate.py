@@ -78,8 +78,8 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
         if port != 8080 and not view:
             raise InputError("port: belongs to --view")
         if suite:
-            taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & fields_set(arguments)
-            if taken or world or goal or start or known or compare or speed or avoid != "none" or json or view:
+            own = "prior learner perturbation seed initial-spread goal start map compare speed margin avoid json view"
+            if world or set(own.split()) & fields_set(arguments):
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
             return _navigate_suite(chosen, quick, out or Path("navigate_suite"), scheduler)
         if quick or scheduler is not None:

@@ -58,6 +58,8 @@ def view_with(arguments: list[str]) -> Callable[..., None]:
             port: Number of the port to listen on.
             code: Whether a sweep may run the Python files of the controller that it names.
         """
+        if export is not None and (new := sorted(fields_set(arguments) & {"host", "port"})):
+            raise InputError(f"{new[0]}: belongs to a page that is served; --export writes a file")
         if file is not None and str(file) != scenario_file:
             if not file.exists():
                 check_switches(arguments)

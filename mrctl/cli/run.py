@@ -47,7 +47,7 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
             code: With --run: whether the Python files of the controller that the sweep names may be run.
         """
         if number is not None:
-            return _repeat(file, number, out, json, code)
+            return _repeat(file, number, arguments, out, json, code)
         if file is not None and file.is_dir():
             return _repeat_saved(file, arguments, out, json, controller)
         if file is not None and str(file) != scenario_file:
@@ -87,19 +87,23 @@ def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json
     expect_same(folder, departs, json)
 
 
-def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:
+def _repeat(
+    store: Path | None, number: int, arguments: Sequence[str], out: Path | None, json: bool, code: bool
+) -> None:
     """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
     if store is None:
         raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
     check_exists(store)
+    if new := sorted(fields_set(arguments) - {"run", "out", "json", "code", "no-code"}):
+        raise InputError(f"{new[0]}: {store} says how its runs are driven; leave --{new[0]} out")
     from mrctl.experiments import single
     from mrctl.sweep import jobs
     from mrctl.sweep.store import Store
 
     jobs.stages_of(store, number, code)
     if out is not None or json:
-        own = jobs.sweep_of(Store(store)).driven_by(number)
-        show(single.run(jobs.scenario_of(store, number), out, json, own), out, json)
+        sweep = jobs.sweep_of(Store(store))
+        show(single.run(sweep.scenario(number), out, json, sweep.driven_by(number), sweep.hindsight), out, json)
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:

@@ -161,15 +161,9 @@ class Episodes:
         share = MAX_RESIDUAL if action == "residual" else 1.0
         self.bound = np.array(limits if action == "twist" else [share * robot.supply] * 2)
         wheel_rate = (robot.max_speed + robot.half_track * robot.max_rotation) / robot.wheel_radius
+        near = HALF_REWARD_DISTANCE
         self.scale = np.array(
-            [
-                HALF_REWARD_DISTANCE,
-                HALF_REWARD_DISTANCE,
-                HALF_REWARD_DISTANCE / robot.half_track,
-                *limits,
-                *limits,
-                robot.max_acceleration,
-            ]
+            [near, near, near / robot.half_track, *limits, *limits, robot.max_acceleration]
             + [robot.max_rotation_acceleration, *[wheel_rate] * 2, robot.steering_limit, *[robot.supply] * 2]
         )
         self._given, self._draw = [s.perturbation for s in self.scenarios], draw

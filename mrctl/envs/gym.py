@@ -196,9 +196,8 @@ class TrackingVectorEnv(VectorEnv):
             render_mode: As for `TrackingEnv`.
 
         Raises:
-            InputError: The file or a scenario is invalid, the scenarios cannot run together, or there is no such
-                `render_mode`.
-            ValueError: The number of scenarios is not B.
+            InputError: The file or a scenario is invalid, the number of scenarios is not B, the scenarios cannot run
+                together, or there is no such `render_mode`.
         """
         self._set_up(Episodes(_several(num_envs, scenario, read), action, draw=draw, threads=threads), render_mode)
 
@@ -309,7 +308,6 @@ class NavigationVectorEnv(TrackingVectorEnv):
 
         Raises:
             InputError: As for `TrackingVectorEnv`.
-            ValueError: The number of scenarios is not B.
         """
         self._set_up(Navigating(_several(num_envs, scenario, read_mission), draw=draw, threads=threads), render_mode)
 
@@ -322,14 +320,15 @@ def _several(
     """Returns a scenario for each of `count` robots.
 
     Raises:
-        ValueError: The number of given scenarios is another one.
+        InputError: There is no robot, the number of given scenarios is another one, or one of them is none.
     """
-    if scenario is None or isinstance(scenario, Scenario | str | Path):
+    if count < 1:
+        raise InputError(f"num_envs: {count} is below 1")
+    if isinstance(scenario, str | Path) or not isinstance(scenario, Sequence):
         return [read(scenario)] * count
-    scenarios = list(scenario)
-    if len(scenarios) != count:
-        raise ValueError(f"num_envs: {count}, but {len(scenarios)} scenarios")
-    return scenarios
+    if len(scenario) != count:
+        raise InputError(f"num_envs: {count}, but {len(scenario)} scenarios")
+    return [read(one) for one in scenario]
 
 
 gymnasium.register(

@@ -13,6 +13,7 @@ from mrctl.control.stages import Stages
 from mrctl.experiments.tables import Report, markdown, number, output_folder
 from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
+from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import named_stages, simulate
 from mrctl.record import InputError
@@ -43,7 +44,7 @@ FIGURES = {  # file: function of `results.plots`
 }
 
 
-def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> Report:
+def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None, hindsight: bool = False) -> Report:
     """Runs a scenario.
 
     Args:
@@ -51,6 +52,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         out: Folder for `result.zarr`, figures and learned weights; None saves nothing.
         as_json: Whether to return JSON instead of a table.
         own: Stages of the user; see `mrctl.loop.user_files`.
+        hindsight: Whether the best fixed feedforward in hindsight drives, in place of the scenario's.
 
     Returns:
         The report, with a row of metrics for each lap that was driven to its end, and what a stage of the user answered
@@ -60,7 +62,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
     """
     with output_folder(out, () if out is None else _written()):
-        result = _driven(scenario, own)
+        result = best_fixed([scenario]) if hindsight else _driven(scenario, own)
     return _report(scenario, result, out, as_json, own)
 
 

@@ -25,7 +25,7 @@ from mrctl.kernel import Array
 from mrctl.loop.simulation import Simulation, uniform
 from mrctl.results import dataset
 from mrctl.results.metrics import over_laps, per_lap
-from mrctl.scenario import FEEDFORWARDS, Scenario
+from mrctl.scenario import Scenario
 
 REPETITIONS = 2
 RIDGE = 1e-6  # share of a feature's sum of squares; keeps coefficients that were never excited at their first guess
@@ -41,7 +41,7 @@ def best_fixed(scenarios: Sequence[Scenario], *, threads: int = 0) -> xr.Dataset
     Raises:
         InputError: As `mrctl.simulate`.
     """
-    scenarios = [s.model_copy(update=FEEDFORWARDS["model"] | {"name": s.name or "hindsight"}) for s in scenarios]
+    scenarios = [s.with_feedforward("model").model_copy(update={"name": s.name or "hindsight"}) for s in scenarios]
     parts = []
     for rows in uniform(scenarios):
         group, coefficients, drives = [scenarios[row] for row in rows], None, []

@@ -120,7 +120,13 @@ def cores() -> int:
 
 
 def worthwhile(threads: int, size: int) -> int:
-    """Returns how many of the allowed threads (0 for all cores) pay for a number of robots."""
+    """Returns how many of the allowed threads (0 for all cores) pay for a number of robots.
+
+    Raises:
+        InputError: The number of threads is negative.
+    """
+    if threads < 0:
+        raise InputError(f"threads: {threads} is below 0, which stands for all cores")
     return min(threads or cores(), max(1, size // MIN_ROBOTS_OF_THREAD))
 
 

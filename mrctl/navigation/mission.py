@@ -132,7 +132,7 @@ def navigate(
     began = perf_counter()
     found, own = prepared(task, scenario, speed, margin, avoid)
     planning_time = perf_counter() - began
-    others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
+    others = [own.with_feedforward(name) for name in compare]
     result = simulate([own, *others], progress=progress, motion=avoiding(avoid))
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven[-1]) + 1))

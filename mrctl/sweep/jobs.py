@@ -167,7 +167,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         "chunk": sweep.chunk_size,
         "samples": sweep.samples,
         "stride": sweep.stride,
-        "control_period": sweep.base.control_period,
+        "control_period": sweep.control_period,
         "signals": list(SIGNALS),
     }
 

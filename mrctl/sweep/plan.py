@@ -249,19 +249,28 @@ class Sweep(Record):
 
         The other axes are at their first listed value, or in the middle of their distribution.
         """
-        middle = {"seed": 0} | {axis.field: axis.listed[0] if axis.listed else axis.middle for axis in self.axes}
         trials = [{}]
         for group in self._dimensions:
             trials += [{self.axes[a].field: self.axes[a].listed[k] for a in group} for k in range(self._length(group))]
         trials += [{axis.field: end} for axis in self.axes for end in axis.uniform or axis.loguniform or ()]
         silent = parent_process() is not None  # a worker reads a sweep that has been checked
         bar = tqdm(trials, desc="checks the values", unit="value", delay=QUIET_TIME, leave=False, disable=silent)
-        periods = {self._assemble(middle | trial).control_period for trial in bar}
+        periods = {self._assemble(self._middle | trial).control_period for trial in bar}
         if len(periods) > 1 and self.record in ("decimated", "full"):
             raise ValueError("control_period: signals share their time axis; keep it, or record metrics")
         first = range(min(self.size, TRIED_RUNS))
         if not any(self.valid(run) for run in first):
             self.scenario(0)  # raises the error of the first run
+
+    @cached_property
+    def _middle(self) -> dict[str, Any]:
+        """The first listed value of each axis, or the middle of its distribution, by field."""
+        return {"seed": 0} | {axis.field: axis.listed[0] if axis.listed else axis.middle for axis in self.axes}
+
+    @property
+    def control_period(self) -> float:
+        """Control period in s of all runs whose signals are kept; the others may differ."""
+        return self._assemble(self._middle).control_period
 
     @cached_property
     def _dimensions(self) -> list[list[int]]:

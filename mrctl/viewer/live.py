@@ -390,6 +390,7 @@ class Live(Page):
         others = start[len(touched) :]
         new = [changed(self._present(s), path, value) for s in touched] + [self._present(s) for s in others]
         if name in CONTROLLER_FIELDS:
+            new[0] = new[0].model_copy(update={"learned": None})  # which another learner cannot start from
             new = [new[0], *(s for s in new[1:] if s.feedforward != new[0].feedforward)]
         self._restart(new)
 
@@ -413,7 +414,7 @@ class Live(Page):
             raise InputError(f"compare with: {title_of(name)} drives already, as the first robot")
         ghosts = [s for s in ghosts if s.feedforward != name]
         if wanted:
-            ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
+            ghosts.append(first.with_feedforward(name))
         self._restart([first, *ghosts])
 
     def _choose_robot(self, name: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.mission import Order
 from mrctl.navigation.planning import prepared as prepare
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.scenario import FeedforwardName, Scenario
 
 if TYPE_CHECKING:
     from mrctl.viewer.page import Page
@@ -36,7 +36,7 @@ def live(scenario: Scenario, compare: Sequence[FeedforwardName], export: Path | 
 
     if export is not None:
         refuse_existing(export)
-    scenarios = [scenario, *(scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare)]
+    scenarios = [scenario, *(scenario.with_feedforward(name) for name in compare)]
     if export is None:
         return _serve(lambda server: Live(scenarios, server), host, port)
     result = simulate(scenarios, progress=True)
@@ -61,7 +61,7 @@ def mission(order: Order, host: str, port: int) -> None:
     def page(server: Server) -> Live:
         plan, own = prepare(order.task, order.scenario, order.speed, order.margin, order.avoid)
         own = own.replace(goal=None)
-        others = [own.replace(name="", **FEEDFORWARDS[name]) for name in order.compare]
+        others = [own.with_feedforward(name) for name in order.compare]
         return Live([own, *others], server, order.avoid, plan.searched)
 
     _serve(page, host, port)

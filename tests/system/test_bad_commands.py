@@ -97,8 +97,8 @@ OTHERS = [
     "dance", "Run", "\x1b[31m", "navigate", "navigate nowhere", "navigate doorway:x", "navigate missing.toml",
     "navigate doorway:1 --goal 1 2", "navigate doorway:1 --margin -1", "navigate doorway:1 --speed nan",
     "navigate doorway:1 --view --avoid mppi --out x", "navigate doorway:1 --view --json",
-    "navigate doorway:1 --port 8081", "navigate doorway:1 --view --port 99999",
-    "navigate doorway:1 --view --goal 9 0 0",
+    "navigate doorway:1 --port 8081", "navigate --suite --speed 0",
+    "navigate doorway:1 --view --port 99999", "navigate doorway:1 --view --goal 9 0 0",
     "navigate text.toml", "navigate latin.toml", "reproduce x", "reproduce --out file/out", "reproduce --nosuch",
     "sweep", "sweep sweep.toml", "sweep missing.toml --out s", "sweep text.toml --out s", "sweep huge.toml --out s",
     "sweep field.toml --out s", "sweep twice.toml --out s", "sweep wide.toml --out s", "sweep mixed.toml --out s",
@@ -118,8 +118,9 @@ OTHERS = [
     "check empty.xml", "check broken.xml", "check nothing", "check racecar --wheels a b", "check --chassis z car",
     f"check {LONG}.xml", "check racecar --steering a b c", "bench x", "view missing", "view missing.toml", "view file",
     "view . ", "view text.toml", "view good.toml --run 1", "view good.toml --compare magic", "view --port x",
-    "view --export there.html", "view pipe.toml", "export missing --to csv --out x", "export . --to csv --out x",
-    "export file --to csv --out x", "export . --to xml --out x", "export . --to csv", "--nosuch", "--version x",
+    "view --export there.html", "view --export x.html --port 9000", "view pipe.toml", "export missing --to csv --out x",
+    "export . --to csv --out x", "export file --to csv --out x", "export . --to xml --out x", "export . --to csv",
+    "--nosuch", "--version x",
 ]  # fmt: skip
 
 

@@ -355,6 +355,10 @@ def test_perturbation_by_name(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     assert scenario.name == "x.toml"
     (tmp_path / "all.toml").write_text('perturbation = "all"')
     assert mrctl.Scenario.from_toml(tmp_path / "all.toml").perturbation == mrctl.PERTURBATIONS["all"]
+    # It replaces that of the file, whatever the file has beside it.
+    (tmp_path / "laden.toml").write_text("[perturbation]\npayload = 5.0")
+    assert cli.main(["run", str(tmp_path / "laden.toml"), "--perturbation", "all", "--json", *SHORT]) == 0
+    assert json.loads(capsys.readouterr().out)["scenario"]["perturbation"]["payload"] == 0
 
 
 COMMANDS = (

@@ -476,6 +476,9 @@ def test_actions():
         (lambda: TrackingVectorEnv(2, [SHORT, SHORT.model_copy(update={"laps": 2})]), "scenarios: differ in"),
         (lambda: TrackingVectorEnv(2, SHORT.model_copy(update={"motion_period": 0.05})), "motion_period: "),
         (lambda: TrackingVectorEnv(3, [SHORT]), "num_envs: 3, but 1 scenarios"),
+        (lambda: TrackingVectorEnv(0, SHORT), "num_envs: 0 is below 1"),
+        (lambda: TrackingVectorEnv(2, 5), "scenario: int is neither"),  # type: ignore
+        (lambda: TrackingVectorEnv(1, [SHORT], threads=-1), "threads: -1 is below 0"),
         (lambda: TrackingEnv("nowhere.toml"), "nowhere.toml: No such file"),
         (lambda: TrackingEnv({"laps": 1}), "scenario: dict is neither a Scenario nor the path of a file"),  # type: ignore
         (lambda: TrackingEnv(SHORT, render_mode="human"), "render_mode: 'human' is not rgb_array"),

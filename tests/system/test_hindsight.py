@@ -1,5 +1,7 @@
 """The best fixed feedforward in hindsight, against the true inverse dynamics and other feedforwards."""
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,6 +15,8 @@ from mrctl import (
     Pid,
     Scenario,
     Sensing,
+    Sweep,
+    cli,
     per_lap,
     replicates,
     simulate,
@@ -21,6 +25,8 @@ from mrctl.control.features import feature_matrix
 from mrctl.loop.hindsight import best_fixed, drive
 from mrctl.loop.simulation import Simulation
 from mrctl.results.metrics import over_laps
+from mrctl.sweep import jobs
+from mrctl.sweep.store import Store
 
 IDEAL = Sensing(tier="ideal")
 BASE = Scenario(sensing=IDEAL, reference=Lemniscate(period=12), laps=2, perturbation=PERTURBATIONS["all"])
@@ -45,6 +51,15 @@ def test_nothing_left_to_explain():
     again = drive(group, twice)[1]
     x = feature_matrix(*BASE.reference.sample(np.linspace(0, 12, 400))[1:], np.array([0.188]), np.ones((1, 8)))
     assert np.abs(x @ (again - twice)[0]).max() < 0.1 * np.abs(x @ (twice - once)[0]).max() + 0.02
+
+
+def test_run_of_a_sweep_again(tmp_path, here, capsys):
+    """`mrctl run STORE --run K` shows the run of the store, not a run with the feedforward of the scenario."""
+    base = {"sensing": {"tier": "ideal"}, "reference": {"kind": "line", "length": 0.8}, "laps": 1, "learner": "none"}
+    jobs.run(Sweep.from_dict({"base": base, "hindsight": True}), tmp_path / "store", 1)
+    assert cli.main(["run", str(tmp_path / "store"), "--run", "0", "--json"]) == 0
+    shown, stored = json.loads(capsys.readouterr().out)["laps"][-1], Store(tmp_path / "store").row(0)
+    assert stored is not None and shown["position_rmse"] == stored["position_rmse"]
 
 
 @pytest.mark.parametrize("steering", ["compliant", "rigid"])

@@ -55,6 +55,16 @@ def test_starts_where_it_ended(name, files):
     assert (found != fresh).any()
 
 
+def test_beside_another_feedforward(files):
+    """What `compare` adds, and the best fixed feedforward, have nothing to do with what the first learner kept."""
+    first = BASE.model_copy(update={"learner": "fel", "learned": files["fel"][0], "laps": 1, "name": "first"})
+    for name in ("none", "model+rls", "fel"):
+        other = first.with_feedforward(name)
+        assert (other.feedforward, other.learned, other.name) == (name, None, "")
+        assert Simulation([other]).ticks == Simulation([first]).ticks
+    assert not mrctl.loop.hindsight.best_fixed([first]).failed.any()
+
+
 @pytest.mark.parametrize("name", LEARNERS[:5])
 def test_transfer(name, files):
     """Learned on one course, frozen on another: it tracks the robot that the model does not know from its first lap on.

@@ -202,6 +202,17 @@ def test_full_with_runs_of_different_length(tmp_path):
         assert finite[run] == round(float(opened["failure_time"][run]) * 100) - 1 > 50
 
 
+def test_times_of_another_control_period(tmp_path):
+    """The time axis of a store is that of its runs, whatever the period of the base is."""
+    scenario = mrctl.Scenario(
+        reference=mrctl.Line(length=0.8), laps=1, learner="none", control_period=0.02, motion_period=0.02
+    )
+    sweep = Sweep.of([scenario], record="full")
+    jobs.run(sweep, tmp_path / "store", 1)
+    alone = mrctl.simulate(sweep.scenario(0))
+    assert np.array_equal(mrctl.open(tmp_path / "store")["time"], alone["time"])
+
+
 # --- one run again --------------------------------------------------------------------------------
 
 
@@ -210,6 +221,8 @@ def test_run_again(sweep, store, tmp_path, capsys):
     for run in (0, 14, failures(sweep)[0]):
         assert cli.main(["run", str(store), "--run", str(run)]) == 0
         assert capsys.readouterr().out == f"run {run}: bit-identical\n"
+    assert cli.main(["run", str(store), "--run", "0", "--laps", "3"]) == 2
+    assert capsys.readouterr().err == f"mrctl: laps: {store} says how its runs are driven; leave --laps out\n"
     array = Store(store)._signals
     column = list(SIGNALS).index("v")
     array[14, 7, column] = np.nextafter(array[14, 7, column], 9)

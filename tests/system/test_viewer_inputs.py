@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import viser
 
-from mrctl import Event, Kanayama, Perturbation, Pid, Scenario, per_lap, simulate
+from mrctl import Event, Kanayama, Line, Perturbation, Pid, Scenario, per_lap, save_learned, simulate
 from mrctl.loop.simulation import arranged
 from mrctl.loop.timeline import CHANGEABLE
 from mrctl.physics import mjcf
@@ -151,6 +151,16 @@ def test_another_learner_before_a_tick(live):
     live._note_input(("learner",), "fel")
     live._apply_inputs()
     assert live.session.tick == 0 and not re.search(r">[0-9]", score())
+
+
+def test_another_learner_than_that_of_the_file(live, tmp_path):
+    """A session that starts from what was learned takes another learner, and a ghost, which start from nothing."""
+    lap = Scenario(reference=Line(length=0.8), laps=1, learner="rls")
+    save_learned(tmp_path / "rls.safetensors", simulate(lap))
+    live._restart([lap.replace(learned=str(tmp_path / "rls.safetensors"))])
+    live._compare("none", True)
+    live._apply(("learner",), "fel")
+    assert [(s.learner, s.learned) for s in live.session.start] == [("fel", None), ("none", None)]
 
 
 def test_typing(live):
