@@ -376,8 +376,10 @@ class Waypoints(Record):
         for k, (a, b) in enumerate(pairwise(places)):
             ends = {"start_curvature": curvatures[2 * k], "end_curvature": curvatures[2 * k + 1]}
             rest = {"start_speed": 0.0} if k else {}
-            part = whole.model_copy(update={"points": self.points[a : b + 1], **ends, **rest})
-            parts.append((part, (k + first) % 2 == 1))
+            back = (k + first) % 2 == 1
+            limits = self.limits.in_reverse if back else self.limits
+            part = whole.model_copy(update={"points": self.points[a : b + 1], "limits": limits, **ends, **rest})
+            parts.append((part, back))
         return parts
 
     def _sample_parts(self, t: Array) -> Motion:

@@ -7,7 +7,7 @@ motion along it has
 
 so that every limit is |a u + b x + c √x + d| ≤ 1 with coefficients that depend on s alone. That includes the motor
 voltages, because the inverse of equation (3) is linear in the features of `mrctl.theory.dynamics.regressor`; c is their
-back-EMF and d their friction. The robot drives forward.
+back-EMF and d their friction. The robot drives forward; `Limits.in_reverse` are the limits of a way backwards.
 
 `fastest` finds the law that takes the least time: a backward pass finds at each place the largest x from which the
 limits can be kept up to the end, and a forward pass accelerates as hard as this bound and the limits allow (Pham and
@@ -88,6 +88,16 @@ class Limits(Record):
             voltage=reserve * robot.supply,
             inverse=tuple((float(common), float(other)) for common, other in inverse_coefficients(robot)),
         )
+
+    @property
+    def in_reverse(self) -> Limits:
+        """The same limits for a way that is driven backwards.
+
+        V and V̇ change their sign and θ̇ keeps it, so that V θ̇ changes its own in the differential voltage, and θ̇² does
+        against the other features in the common voltage.
+        """
+        signs = (1, 1, 1, 1, -1, -1, 1, 1)
+        return self.replace(inverse=[[sign * c for c in row] for sign, row in zip(signs, self.inverse, strict=False)])
 
 
 class Path(NamedTuple):

@@ -224,6 +224,27 @@ def test_every_limit_holds_from_a_start_speed(name, radii, speed, supply, smooth
         assert again._law.law.start == pytest.approx(first, rel=0.02, abs=1e-3)
 
 
+@settings(max_examples=40)
+@given(st.lists(st.floats(0.2, 2), min_size=3, max_size=8), st.floats(0.2, 1), st.floats(0.2, 1), st.floats(-0.3, 0.3))
+def test_every_limit_holds_in_reverse(radii, speed, supply, com_offset):
+    """So they do backwards, where the centre of mass is on the other side of the axle, as seen from the motion."""
+    robot = CAR.model_copy(update={"com_offset": com_offset, "supply": supply * CAR.supply})
+    p = np.array(radii) * np.exp(2j * np.pi * np.arange(len(radii)) / len(radii))
+    limits, top = Limits.of(robot), speed * robot.max_speed
+    fixed = {
+        "points": [(z.real, z.imag) for z in p],
+        "closed": False,
+        "timing": "limits",
+        "limits": limits.model_dump(),
+    }
+    try:
+        course = Waypoints.from_dict({**fixed, "speed": top, "cusps": [0]})
+    except InputError:
+        reject()
+    motion = course.sample(np.linspace(0, course.period, 5001))
+    assert motion.twist[:, 0].max() < 1e-12 and loads(motion, robot, limits, top).max() <= 1.01
+
+
 @pytest.mark.full
 def test_every_limit_holds_full():
     """So for 9,700 curves, which with the plans of missions are 10⁴."""
