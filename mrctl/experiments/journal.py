@@ -15,7 +15,7 @@ from mrctl.loop.simulation import cores
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
 from mrctl.sweep.jobs import code_digest
-from mrctl.sweep.pool import Cluster, Outcome, carry_out, check_address
+from mrctl.sweep.pool import Cluster, JobOutcome, carry_out, check_address
 
 SHOWING_ROOMS = ("envs", "viewer", "cli", "__main__.py")  # rooms on which no experiment depends
 
@@ -124,7 +124,7 @@ class Journal:
     def _on_cluster(self, parts: Sequence[Computation], missing: Sequence[int], scheduler: str, bar: tqdm) -> None:
         """Has a cluster do computations, and keeps their results."""
 
-        def ended(outcome: Outcome) -> None:
+        def ended(outcome: JobOutcome) -> None:
             if not outcome.error:
                 self[parts[outcome.job].key] = outcome.value
                 bar.update()
@@ -165,10 +165,10 @@ class Remote(NamedTuple):
     there: dict[str, str]
     """Versions of the packages of the process that asks, what `origin` returned there, and the digest of its code."""
 
-    def __call__(self, _: str, job: int) -> Outcome:
+    def __call__(self, _: str, job: int) -> JobOutcome:
         """Does a computation with one thread."""
         here = versions() | self.origin() | {"code": code_digest(SHOWING_ROOMS)}
         if other := next((name for name, value in self.there.items() if here.get(name) != value), ""):
             who = f"worker {os.getpid()} on {os.uname().nodename}"
-            return Outcome(job, error=f"scheduler: {who} has another {other} than this process", fatal=True)
-        return Outcome(job, value=pickle.loads(self.computed[job])(1))  # noqa: S301 (from the process that asks)
+            return JobOutcome(job, error=f"scheduler: {who} has another {other} than this process", fatal=True)
+        return JobOutcome(job, value=pickle.loads(self.computed[job])(1))  # noqa: S301 (from the process that asks)

@@ -1,7 +1,8 @@
 """A filter that changes a requested twist as little as the barrier of `barrier` asks for.
 
 `avoid` returns the nearest of the twists that are allowed, and `Avoiding` is a motion stage whose requests pass it, by
-what the robot knows: its map, and what its lidar sees beside the map (`Sight`).
+what the robot knows: its map, and what its lidar sees beside the map (`Sight`). Both are for motion controllers of a
+user. A mission with `barrier` follows a plan in time, which `pacing` slows by the same barrier instead.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
 from mrctl.sweep.plan import CONTROLLER_FIELD, Sweep
-from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work, carry_out, check_address
+from mrctl.sweep.pool import Cluster, JobOutcome, Pool, Processes, Work, carry_out, check_address
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
 
@@ -39,7 +39,7 @@ TOLERANCE = 1e-9  # relative difference within which a repeated run agrees
 SET_ASIDE = "set aside: "
 
 
-class Report(NamedTuple):
+class SweepReport(NamedTuple):
     """How a sweep ended."""
 
     runs: int
@@ -56,7 +56,7 @@ def run(
     scheduler: str | None = None,
     progress: bool = False,
     work: Work | None = None,
-) -> Report:
+) -> SweepReport:
     """Runs a sweep, or those jobs of it that are not done yet.
 
     The store holds the same values for any number of workers and any interruptions. In a script, call this function
@@ -100,7 +100,7 @@ def run(
                 rows = (_table(sweep, lost[job]) if job in lost else store.rows(job) for job in range(store.jobs))
                 store.finish(sweep.columns, rows, complete=not aside)
             failed = _failed([store.table])
-            return Report(store.size, failed, {store.runs(job): why for job, why in sorted(aside.items())})
+            return SweepReport(store.size, failed, {store.runs(job): why for job, why in sorted(aside.items())})
     except OSError as error:
         raise InputError(f"{out}: {error.strerror or error}; what was done is kept") from None
 
@@ -129,7 +129,7 @@ def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> 
     with tqdm(total=store.size, initial=kept, unit="run", disable=not progress) as bar:
         bar.set_postfix(failed=failed)
 
-        def ended(outcome: Outcome) -> None:
+        def ended(outcome: JobOutcome) -> None:
             nonlocal failed
             size = len(store.runs(outcome.job))
             failed += size if outcome.error else outcome.failed
@@ -218,7 +218,7 @@ def _models(sweep: Sweep) -> dict[str, str]:
     return worlds | {own: user_files.digest(own) for own in sweep.drivers if own}
 
 
-def compute(path: str, job: int) -> Outcome:
+def compute(path: str, job: int) -> JobOutcome:
     """Computes the runs of a job in a worker and writes them to the store.
 
     Args:
@@ -230,13 +230,13 @@ def compute(path: str, job: int) -> Outcome:
         sweep = _agreed(json.dumps(store.manifest))
         rows, signals = _compute(sweep, store.runs(job), store.samples)
         store.write(job, _table(sweep, rows), signals)
-        return Outcome(job, failed=sum(row["failed"] for row in rows))
+        return JobOutcome(job, failed=sum(row["failed"] for row in rows))
     except InputError as error:
-        return Outcome(job, error=str(error), fatal=True)
+        return JobOutcome(job, error=str(error), fatal=True)
     except OSError as error:
-        return Outcome(job, error=f"{path}: {error.strerror or error}", fatal=True)
+        return JobOutcome(job, error=f"{path}: {error.strerror or error}", fatal=True)
     except Exception as error:  # noqa: BLE001 (whatever the error is, the other jobs go on)
-        return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
+        return JobOutcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
 
 
 @lru_cache(1)

@@ -27,7 +27,7 @@ SCHEDULER_PATIENCE = 30.0  # s to wait for a scheduler and its first worker
 PRELOADED = "numba", "scipy.optimize", "dask.array"  # imported in a worker's first run; xarray looks for Dask's arrays
 
 
-class Outcome(NamedTuple):
+class JobOutcome(NamedTuple):
     """How a job ended."""
 
     job: int
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
     """What the job returns, where it does not write it to a store."""
 
 
-Work = Callable[[str, int], Outcome]
+Work = Callable[[str, int], JobOutcome]
 """Function that computes a job in a worker, from the path of the store and the number of the job."""
 
 
@@ -62,7 +62,7 @@ class Pool(Protocol):
         """Starts a job."""
         ...
 
-    def wait(self) -> list[Outcome]:
+    def wait(self) -> list[JobOutcome]:
         """Waits until at least one job has ended; returns the outcomes."""
         ...
 
@@ -71,7 +71,7 @@ class Pool(Protocol):
         ...
 
 
-def carry_out(pool: Pool, jobs: Iterable[int], ended: Callable[[Outcome], None]) -> dict[int, str]:
+def carry_out(pool: Pool, jobs: Iterable[int], ended: Callable[[JobOutcome], None]) -> dict[int, str]:
     """Lets a pool compute jobs; returns why some were set aside, by job.
 
     A job that kills its worker or raises an error is tried again after the others, alone, before it is set aside.
@@ -147,7 +147,7 @@ class Processes:
             time.sleep(KILL_PAUSE)
         raise InputError("workers: no process can be started; what was done is kept")
 
-    def wait(self) -> list[Outcome]:
+    def wait(self) -> list[JobOutcome]:
         """Waits for outcomes, or for pipes that break because their process died."""
         outcomes = []
         for pipe in wait(list(self._busy)):
@@ -161,7 +161,7 @@ class Processes:
                 pipe.close()
                 code = process.exitcode or 0
                 how = f"signal {-code}" if code < 0 else f"exit status {code}"
-                outcomes.append(Outcome(job, error=f"its worker died ({how})"))
+                outcomes.append(JobOutcome(job, error=f"its worker died ({how})"))
         return outcomes
 
     def close(self) -> None:
@@ -275,7 +275,7 @@ class Cluster:
         self._jobs[future] = job
         future.add_done_callback(self._ended.put)
 
-    def wait(self) -> list[Outcome]:
+    def wait(self) -> list[JobOutcome]:
         """Waits until a job has ended; returns its outcome."""
         while True:
             with contextlib.suppress(Empty):
@@ -283,7 +283,7 @@ class Cluster:
                 return [self._call(self._outcome, future, self._jobs.pop(future))]
             self.room()  # raises an error if the scheduler is gone
 
-    def _outcome(self, future: Any, job: int) -> Outcome:  # noqa: ANN401
+    def _outcome(self, future: Any, job: int) -> JobOutcome:  # noqa: ANN401
         if future.status == "cancelled":
             raise CancelledError
         error = future.exception()
@@ -291,10 +291,10 @@ class Cluster:
             return future.result()
         if "deserializ" in str(error):
             why = f"scheduler: {self._address}: it or its workers have another version of mrctl"
-            return Outcome(job, error=why, fatal=True)
+            return JobOutcome(job, error=why, fatal=True)
         if isinstance(error, self._distributed.KilledWorker):
-            return Outcome(job, error="its worker died repeatedly")
-        return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
+            return JobOutcome(job, error="its worker died repeatedly")
+        return JobOutcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
 
     def close(self) -> None:
         """Cancels jobs that are running and disconnects; the cluster keeps running."""

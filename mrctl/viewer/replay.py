@@ -24,7 +24,7 @@ from mrctl.viewer.server import Server
 SAMPLES = 800  # about the largest number of samples in a curve
 
 
-class Replay(Page):
+class ReplayPage(Page):
     """The page of finished runs."""
 
     def __init__(self, library: Library, runs: Sequence[int], server: Server) -> None:

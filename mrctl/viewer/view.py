@@ -84,7 +84,7 @@ def replay(folder: Path, run: int | None, export: Path | None, host: str, port: 
     from mrctl.viewer.export import export as write
     from mrctl.viewer.export import refuse_existing
     from mrctl.viewer.recording import MAX_SHOWN, Library, looks_of
-    from mrctl.viewer.replay import Replay
+    from mrctl.viewer.replay import ReplayPage
 
     if export is not None:
         refuse_existing(export)
@@ -96,7 +96,7 @@ def replay(folder: Path, run: int | None, export: Path | None, host: str, port: 
     if run is None and len(table) <= MAX_SHOWN:
         shown = [int(k) for k in table.index]
     if export is None:
-        return _serve(lambda server: Replay(library, shown, server), host, port)
+        return _serve(lambda server: ReplayPage(library, shown, server), host, port)
     recordings = [library.recording(k) for k in shown]
     write(recordings, looks_of(recordings, shown), export)
     left_out = f" (run {shown[0]} of {len(table)}; --run takes another)" if len(shown) < len(table) else ""

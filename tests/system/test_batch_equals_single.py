@@ -33,7 +33,7 @@ from mrctl.physics.plant import BatchPlant, PhysicsPlant
 from mrctl.results.dataset import SIGNALS
 from mrctl.sensing.tiers import TIERS, Sensing
 from mrctl.sweep import jobs
-from mrctl.sweep.pool import Outcome
+from mrctl.sweep.pool import JobOutcome
 from mrctl.sweep.store import Store
 
 pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
@@ -294,9 +294,9 @@ def test_layouts():
     assert [[counts[row] for row in group] for group in rows] == [[1], [2, 3], [4, 7], [8]]
 
 
-def first_half(path: str, job: int) -> Outcome:
+def first_half(path: str, job: int) -> JobOutcome:
     """The sweep stops after half of its jobs."""
-    return Outcome(job, error="half", fatal=True) if job >= Store(path).jobs // 2 else jobs.compute(path, job)
+    return JobOutcome(job, error="half", fatal=True) if job >= Store(path).jobs // 2 else jobs.compute(path, job)
 
 
 SWEPT = (6, 6), pytest.param((100, 50), marks=pytest.mark.full)

@@ -23,7 +23,7 @@ from mrctl.navigation.planning import prepared
 from mrctl.navigation.tasks import task_of
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
-from mrctl.sweep.pool import Outcome
+from mrctl.sweep.pool import JobOutcome
 from mrctl.sweep.store import Store
 
 ALIKE = 90  # difference of the numbers of missions that have the same kind of world, robot and localisation
@@ -56,7 +56,7 @@ for name in sys.argv[2:]:
 """
 
 
-def killing(path: str, job: int) -> Outcome:
+def killing(path: str, job: int) -> JobOutcome:
     """Kills the process of the sweep in the middle."""
     if job == Store(path).jobs // 2:
         os.kill(int(os.environ["VICTIM"]), signal.SIGKILL)

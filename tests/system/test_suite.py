@@ -29,7 +29,7 @@ from mrctl.experiments.cases import Case
 from mrctl.loop.hindsight import best_fixed
 from mrctl.results import metrics, plots
 from mrctl.sweep import jobs
-from mrctl.sweep.pool import Outcome, Processes
+from mrctl.sweep.pool import JobOutcome, Processes
 from mrctl.sweep.store import Store
 from mrctl.viewer.recording import Library
 
@@ -349,7 +349,7 @@ def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path, monkeypatch: pyte
     assert content(out) == content(whole) and done.stat().st_mtime_ns == stamp
 
 
-def held(path: str, job: int) -> Outcome:
+def held(path: str, job: int) -> JobOutcome:
     """Computes a job, but the last one of the second feedforward is not done before it is interrupted."""
     if Path(path).name == "model" and job == Store(path).jobs - 1:
         time.sleep(60)

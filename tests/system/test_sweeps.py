@@ -31,7 +31,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 from mrctl.sweep.jobs import compute
-from mrctl.sweep.pool import Outcome
+from mrctl.sweep.pool import JobOutcome
 from mrctl.sweep.store import KIND, Store
 
 KILLS = [moment if moment < 1 else pytest.param(moment, marks=pytest.mark.full) for moment in range(36)]  # per victim
@@ -643,7 +643,7 @@ def test_finished_jobs_are_kept(sweep, tmp_path, whole):
 
 
 def tired(path, job):
-    return Outcome(job, error=f"worker {job} is tired", fatal=True) if job == 3 else compute(path, job)
+    return JobOutcome(job, error=f"worker {job} is tired", fatal=True) if job == 3 else compute(path, job)
 
 
 def test_a_small_sweep_keeps_what_it_has_done(file, tmp_path, whole):
@@ -658,7 +658,7 @@ def test_a_small_sweep_keeps_what_it_has_done(file, tmp_path, whole):
 
 def only_rest(path, job):
     assert job >= 3
-    return Outcome(job, error=f"worker {job} is tired", fatal=True) if job == 4 else compute(path, job)
+    return JobOutcome(job, error=f"worker {job} is tired", fatal=True) if job == 4 else compute(path, job)
 
 
 # --- memory ---------------------------------------------------------------------------------------
@@ -671,7 +671,7 @@ def instantly(path, job):
     columns = jobs._agreed((store.path / "sweep.json").read_text()).columns
     empty = pa.Table.from_pylist([{"failed": False}] * len(runs), columns)
     store.write(job, empty.set_column(0, columns.field(0), pa.array(runs)), None)
-    return Outcome(job)
+    return JobOutcome(job)
 
 
 def resident():

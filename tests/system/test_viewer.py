@@ -23,7 +23,7 @@ from mrctl.viewer.live import Live, buttons
 from mrctl.viewer.looks import looks
 from mrctl.viewer.plots import CURSOR_COLOUR
 from mrctl.viewer.recording import Library
-from mrctl.viewer.replay import Replay
+from mrctl.viewer.replay import ReplayPage
 from mrctl.viewer.scatter import DROVE_COLOUR, RING_SIZE
 from mrctl.viewer.server import Server
 
@@ -566,7 +566,7 @@ def test_replay(browser, tmp_path):
     save(result, tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
     with (
-        serving(lambda server: Replay(library, [0, 1], server)) as (replay, url),
+        serving(lambda server: ReplayPage(library, [0, 1], server)) as (replay, url),
         visit(browser, url, slowly=True) as page,
     ):
         until(lambda: node(page, ROBOT) is not None, "the scene")
@@ -729,7 +729,7 @@ def test_estimate_replay(browser, tmp_path):
     save(result, tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
     with (
-        serving(lambda server: Replay(library, [0], server)) as (replay, url),
+        serving(lambda server: ReplayPage(library, [0], server)) as (replay, url),
         visit(browser, url, slowly=True) as page,
     ):
         until(lambda: node(page, f"{MARKS}/estimate") is not None, "the scene")
@@ -741,7 +741,7 @@ def test_estimate_replay(browser, tmp_path):
         assert np.allclose(node(page, f"{MARKS}/estimate")[:2], [measured.x_measured, measured.y_measured], atol=1e-5)
     old = result.drop_vars([name for name in result if "measured" in str(name) or str(name).startswith("fix_")])
     save(old, tmp_path / "old.zarr")
-    with serving(lambda server: Replay(Library(tmp_path / "old.zarr"), [0], server)) as (replay, _):
+    with serving(lambda server: ReplayPage(Library(tmp_path / "old.zarr"), [0], server)) as (replay, _):
         assert not replay.marks[0]
         replay.sensors.value = True
         replay.draw()
@@ -821,7 +821,7 @@ def test_colours_of_a_sweep(tmp_path):
         jobs.run(Sweep.from_dict({"base": base, "axes": axes}), tmp_path / field, workers=1)
         server = Server(port=0)
         library = Library(tmp_path / field)
-        replay = Replay(library, [0], server)
+        replay = ReplayPage(library, [0], server)
         scatter = replay._scatter
         assert scatter is not None
         chosen, colours = scatter.colours()
@@ -848,7 +848,7 @@ def test_sweep(browser, tmp_path):
     jobs.run(Sweep.from_dict({"runs": 6, "base": base, "axes": [axis]}), tmp_path / "store", workers=1)
     library = Library(tmp_path / "store")
     with (
-        serving(lambda server: Replay(library, [0], server)) as (replay, url),
+        serving(lambda server: ReplayPage(library, [0], server)) as (replay, url),
         visit(browser, url, slowly=True) as page,
     ):
         page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software

@@ -32,7 +32,7 @@ from mrctl.viewer.export import _curves
 from mrctl.viewer.live import SAMPLES, WINDOW, Live
 from mrctl.viewer.page import arrivals
 from mrctl.viewer.recording import Library, looks_of
-from mrctl.viewer.replay import Replay
+from mrctl.viewer.replay import ReplayPage
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import Session
 
@@ -93,7 +93,7 @@ def test_obstacles_move(server, tmp_path):
     positions, _ = live.session.simulations[0][1].plant.mocap
     assert np.allclose([m.position for m in live._scene._movers], positions[0], atol=1e-12)
     save(simulate(DRIVE), tmp_path / "result.zarr")
-    replay = Replay(Library(tmp_path / "result.zarr"), [0], server)
+    replay = ReplayPage(Library(tmp_path / "result.zarr"), [0], server)
     for time in (1.3, 0.0):
         replay._scrub(time)
         replay.draw()
@@ -109,7 +109,7 @@ def test_replay_of_a_mission(server, tmp_path):
     """Its plan is the reference, the outlines stand at start and goal, and the clearance is that of the result."""
     mission = navigate(ROOM, PID, compare=["model"])
     save(mission.result, tmp_path / "result.zarr")
-    replay = Replay(Library(tmp_path / "result.zarr"), [0, 1], server)
+    replay = ReplayPage(Library(tmp_path / "result.zarr"), [0, 1], server)
     for time, there in ((0.5, 0), (replay.duration, 2)):
         replay._scrub(time)
         replay.draw()
@@ -147,7 +147,7 @@ def test_score_of_a_mission(server, tmp_path):
     expected = np.stack([1e3 * of.position_rmse, 100 * of.feedback_share, of.energy])
     assert expected[0] == pytest.approx(1e3 * mission.table["position_rmse"])
     save(mission.result, tmp_path / "result.zarr")
-    replay = Replay(Library(tmp_path / "result.zarr"), [0, 1], server)
+    replay = ReplayPage(Library(tmp_path / "result.zarr"), [0, 1], server)
     half = replay.duration / 2
     for time in (replay.duration, half):
         replay._scrub(time)
@@ -271,7 +271,7 @@ def test_scans_of_a_replay(who, server, tmp_path, monkeypatch):
                 assert found is None  # it was taken before the interval
             else:
                 assert np.array_equal(found, scans[last])
-    replay = Replay(library, [int(library.table.index[0])], server)
+    replay = ReplayPage(library, [int(library.table.index[0])], server)
     assert replay.recordings[0].label == {"particles": "PID alone", "window": "PID alone + window"}[who]
     replay.sensors.value = True
     replay._scrub(0.5)

@@ -24,7 +24,7 @@ from mrctl.scenario import FEEDFORWARDS
 from mrctl.sweep import jobs
 from mrctl.viewer.live import Live
 from mrctl.viewer.recording import Library
-from mrctl.viewer.replay import Replay
+from mrctl.viewer.replay import ReplayPage
 
 __all__ = ["browser"]  # a fixture
 pytestmark = pytest.mark.full
@@ -81,7 +81,7 @@ def test_rollover(browser, tmp_path):
     tips = high, Event(time=8.0, push=(0.0, 350.0, 0.0), push_duration=0.3)
     save(simulate([BASE.replace(learner="none", events=tips), BASE.replace(events=(high,))]), tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
-    with serving(lambda server: Replay(library, [0, 1], server)) as (replay, url), visit(browser, url) as page:
+    with serving(lambda server: ReplayPage(library, [0, 1], server)) as (replay, url), visit(browser, url) as page:
         until(lambda: node(page, ROBOT) is not None and page.evaluate(AXES), "the scene")
         page.locator(".mantine-Notification-closeButton").click()
         page.get_by_text("pause", exact=True).click()
@@ -98,7 +98,7 @@ def test_sweep(browser, tmp_path):
     ]
     jobs.run(Sweep.from_dict({"runs": 20, "base": base, "axes": axes}), tmp_path / "store", workers=1)
     with (
-        serving(lambda server: Replay(Library(tmp_path / "store"), [0], server)) as (_, url),
+        serving(lambda server: ReplayPage(Library(tmp_path / "store"), [0], server)) as (_, url),
         visit(browser, url) as page,
     ):
         page.locator(".mantine-Notification-closeButton").click()

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from mrctl import cli
 from mrctl.sweep import jobs
-from mrctl.sweep.pool import Outcome
+from mrctl.sweep.pool import JobOutcome
 from mrctl.sweep.store import Store
 
 
-def held(path: str, job: int) -> Outcome:
+def held(path: str, job: int) -> JobOutcome:
     """Computes a job; one of the second half waits before."""
     while job >= Store(path).jobs // 2 and not Path(path).with_name("go").exists():
         time.sleep(0.02)
