@@ -60,7 +60,10 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
     runs = {case.name: case for case in outcome.cases}
     found = outcome.runs
     drawn: dict[str, tuple[Any, str]] = {}
-    mean = "Mean over the replicates; the band is their range. Laps are counted from 1."
+    mean = (
+        "Mean over the replicates that finished, and their range as a band; the legend counts those that failed in any "
+        "panel. Laps are counted from 1."
+    )
     steady = {name: _labelled(found[name]) for name in ("nominal", "all") if name in found}
     drawn["error_per_lap"] = (
         plots.laps_by_case(steady, "position_rmse"),

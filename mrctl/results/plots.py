@@ -23,6 +23,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator
+from numpy.typing import NDArray
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
@@ -261,6 +262,9 @@ def feedforward_outputs(
 def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omega_rmse")) -> Figure:
     """Draws metrics lap by lap on a log axis, with a thin line for each run and a thick one for the mean of each label.
 
+    The mean is over the runs that finished, so that it is over the same runs in each lap; where none of a label
+    finished, it is over the laps that all of them drove.
+
     Args:
         result: What `simulate` or `metrics.per_lap` returns.
         metrics: Names in `METRICS`; each has a panel.
@@ -288,16 +292,14 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         ends: list[tuple[float, float, str, str]] = []
         for label, colour in _colours(laps).items():
             rows = [row for row, other in enumerate(labels) if other == label]
-            values = scale * laps[name].values[rows]
-            finite = np.isfinite(values)
-            some = finite.any(0)
-            mean = np.where(finite, values, 0).sum(0)[some] / finite.sum(0)[some]
+            values, failed = scale * laps[name].values[rows], laps["failed"].values[rows].astype(bool)
+            kept, whole = _finished(values, failed)
+            mean = kept[:, whole].mean(axis=0)
             if len(rows) > 1:
                 one.plot(number, values.T, color=colour, lw=0.5, alpha=0.4)
-            one.plot(number[some], mean, "o-", ms=2.5, lw=1.2, color=colour)
-            failed = int(laps["failed"].values[rows].sum())
-            at = (number[some][-1], mean[-1]) if some.any() else (number[0], np.nan)
-            ends.append((float(at[0]), float(at[1]), _counted(label, failed, len(rows)), colour))
+            one.plot(number[whole], mean, "o-", ms=2.5, lw=1.2, color=colour)
+            at = (number[whole][-1], mean[-1]) if whole.any() else (number[0], np.nan)
+            ends.append((float(at[0]), float(at[1]), _counted(label, int(failed.sum()), len(rows)), colour))
         one.set(title=text, yscale="log")
         one.xaxis.get_major_locator().set_params(integer=True)
         _plain(one)
@@ -311,6 +313,9 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
 @styled
 def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence[int] = ()) -> Figure:
     """Draws a metric lap by lap on a log axis, in a panel for each case: mean and range of the runs that share a label.
+
+    Mean and range are over the runs that finished, so that they are over the same runs in each lap; where none of a
+    label finished, they are over the laps that all of them drove. The legend says how many failed, in all cases.
 
     Args:
         cases: Datasets as `metrics.per_lap` returns them, by title.
@@ -326,18 +331,19 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
     rows = -(-len(cases) // columns)
     figure, axes = _figure(PAGE_WIDTH, (0.12 + 0.55 * rows) * COLUMN_WIDTH, rows=rows, columns=columns, sharey=True)
-    order: list[str] = []
+    lost: dict[str, list[bool]] = {}  # whether each run failed, by label
     for one, (title, laps) in zip(axes, cases.items(), strict=False):
         number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
         for label in dict.fromkeys(labels):
-            order += [label] if label not in order else []
-            values = scale * laps[metric].values[[row for row, other in enumerate(labels) if other == label]]
-            some = np.isfinite(values).any(0)
-            line = _line(order.index(label))
-            if some.any():
-                low, mean, high = (f(values[:, some], 0) for f in (np.nanmin, np.nanmean, np.nanmax))
-                one.fill_between(number[some], low, high, color=line["color"], alpha=0.15, lw=0)
-                one.plot(number[some], mean, marker=".", ms=3, **line)
+            rows = [row for row, other in enumerate(labels) if other == label]
+            failed = laps["failed"].values[rows].astype(bool)
+            lost.setdefault(label, []).extend(failed.tolist())
+            values, whole = _finished(scale * laps[metric].values[rows], failed)
+            line = _line([*lost].index(label))
+            if whole.any():
+                low, mean, high = (f(values[:, whole], axis=0) for f in (np.min, np.mean, np.max))
+                one.fill_between(number[whole], low, high, color=line["color"], alpha=0.15, lw=0)
+                one.plot(number[whole], mean, marker=".", ms=3, **line)
         for lap in changes:
             one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
         one.set(title=title, yscale="log")
@@ -350,8 +356,9 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
             one.set_ylabel(text, fontsize=8)
     for unused in axes[len(cases) :]:
         unused.remove()
-    handles = [Line2D([], [], **_line(k)) for k in range(len(order))]
-    figure.legend(handles, order, loc="outside upper center", ncols=min(4, len(order)))
+    handles = [Line2D([], [], **_line(k)) for k in range(len(lost))]
+    names = [_counted(label, sum(failed), len(failed)) for label, failed in lost.items()]
+    figure.legend(handles, names, loc="outside upper center", ncols=min(4, len(names)))
     return figure
 
 
@@ -462,6 +469,15 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
                 if column == channel == 0:
                     panel.set_ylabel(f"{name}\n$\\dot\\theta$ (rad/s)")
     return figure
+
+
+def _finished(values: Array, failed: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """Returns the values (runs, laps) of the runs that finished, or of all if none did, and which laps all these have.
+
+    A mean of the runs that are still alive would fall where a bad one fails.
+    """
+    kept = values if failed.all() else values[~failed]
+    return kept, np.asarray(np.isfinite(kept).all(axis=0))
 
 
 def _line(order: int) -> dict[str, Any]:

@@ -291,6 +291,23 @@ def test_laps_by_case():
     assert "(J)" in first.get_ylabel()
 
 
+def test_mean_of_the_runs_that_finished():
+    """A mean does not fall where the worst run fails, and the legend counts the failures of all panels."""
+    result = make(["fel", "fel", "none", "none"])
+    result["lateral_error"][:] = np.array([1.0, 9.0, 2.0, 3.0])[:, None]
+    laps = metrics.per_lap(fail(fail(fail(result, 1, 2.5), 2, 4.5), 3, 2.5))
+    figure = plots.laps_by_case({"ice": laps, "dry": metrics.per_lap(result)}, "lateral_rmse")
+    assert legend(figure) == ["fel (1 of 4 failed)", "none (2 of 4 failed)"]
+    icy, dry = figure.axes
+    np.testing.assert_allclose(icy.lines[0].get_xydata(), [[1, 1e3], [2, 1e3], [3, 1e3]])
+    np.testing.assert_allclose(icy.lines[1].get_xydata(), [[1, 2500]])  # no run finished: the laps that both drove
+    np.testing.assert_allclose(dry.lines[0].get_ydata(), [5e3] * 3)
+    (axes,) = plots.learning_curve(laps, ["lateral_rmse"]).axes
+    thick = [line for line in axes.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(thick[0].get_ydata(), [1e3] * 3)
+    np.testing.assert_allclose(thick[1].get_ydata(), [2500])
+
+
 def test_distributions():
     """The share of all runs, so that one that failed keeps its line below one."""
     figure = plots.distributions({"fel": np.array([3.0, np.nan, 1.0, 2.0])}, "ratio")
