@@ -31,8 +31,7 @@ from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
 from mrctl.results.dataset import check_kind, scenarios_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
-from mrctl.scenario import Scenario
-from mrctl.theory.obstacles import turned
+from mrctl.theory.obstacles import Obstacles, turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 
 COLUMN_WIDTH, PAGE_WIDTH = 88 / 25.4, 180 / 25.4  # inches
@@ -142,12 +141,25 @@ def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int
 
     Obstacles are grey; one that moves is drawn as an outline where it is at the end, with a dotted line from where it
     was at the beginning.
+
+    Raises:
+        InputError: Runs drove among different obstacles, so they cannot share a figure.
     """
     figure, (axes,) = _figure(COLUMN_WIDTH, COLUMN_WIDTH * 0.95)
     curves = _curves(result, window, lap)
     if "scenarios" in result.attrs:
         times = max((data["time"].values[np.isfinite(data["x"].values)] for data, *_ in curves), key=len)
-        _surroundings(axes, scenarios_of(as_runs(result))[0], times)
+        scenarios = scenarios_of(as_runs(result))
+        for scenario, curve in zip(scenarios, curves, strict=True):
+            if scenario.obstacles != scenarios[0].obstacles:
+                other, first = (int(one.data["run"]) for one in (curve, curves[0]))
+                raise InputError(
+                    f"result: run {other} drove among other obstacles than run {first}; draw one world at a time, such "
+                    "as result.isel(run=[0])"
+                )
+        _surroundings(axes, scenarios[0].obstacles, times)
+        for x, y, _ in dict.fromkeys(scenario.goal for scenario in scenarios if scenario.goal is not None):
+            axes.plot(x, y, "*", ms=7, color="0.25", zorder=4)
     _references(axes, curves, "x_ref", "y_ref")
     for data, _, style in curves:
         x, y = data["x"].values, data["y"].values
@@ -493,9 +505,9 @@ def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey
     return figure, list(axes.flat)
 
 
-def _surroundings(axes: Axes, scenario: Scenario, times: Array) -> None:
-    """Draws the obstacles of a scenario, where they are at times in s, and its goal."""
-    for shape in scenario.obstacles.shapes:
+def _surroundings(axes: Axes, obstacles: Obstacles, times: Array) -> None:
+    """Draws obstacles where they are at times in s."""
+    for shape in obstacles.shapes:
         disc = shape.kind == "disc"
         corners = np.array([(shape.x, shape.y)] if disc else shape.vertices)
         if shape.course is None:
@@ -506,8 +518,6 @@ def _surroundings(axes: Axes, scenario: Scenario, times: Array) -> None:
             patch = Circle(places[-1, 0], shape.radius) if disc else Polygon(places[-1])
             axes.add_patch(patch).set(facecolor="none", edgecolor="0.6", lw=0.8)
             axes.plot(*places.mean(axis=1).T, ":", color="0.6", lw=0.8)
-    if scenario.goal is not None:
-        axes.plot(*scenario.goal[:2], "*", ms=7, color="0.25", zorder=4)
 
 
 def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> list[Curve]:

@@ -219,6 +219,26 @@ def test_surroundings():
     assert star.get_xydata().tolist() == [[3, 0]]
 
 
+def test_worlds_of_a_path():
+    """Runs in the same world share a figure, with the goal of each; runs in different ones are refused in one line."""
+    disc, other = (Obstacles(shapes=(Disc(x=x, y=1, radius=0.3),)) for x in (1, 2))
+    result = make()
+
+    def driven(*scenarios: Scenario) -> xr.Dataset:
+        return result.assign_attrs(scenarios=json.dumps([one.model_dump(mode="json") for one in scenarios]))
+
+    (axes,) = plots.path(driven(Scenario(obstacles=disc, goal=(3, 0, 0)), Scenario(obstacles=disc))).axes
+    stars = lambda axes: [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "*"]  # noqa: E731
+    assert len(axes.patches) == 1 and stars(axes) == [[[3, 0]]]
+    goals = [Scenario(obstacles=disc, goal=(x, 0, 0)) for x in (3, 4)]
+    assert stars(plots.path(driven(*goals)).axes[0]) == [[[3, 0]], [[4, 0]]]
+    different = driven(Scenario(obstacles=disc), Scenario(obstacles=other))
+    with pytest.raises(InputError, match=r"^result: run 1 drove among other obstacles than run 0; draw one world .*$"):
+        plots.path(different)
+    (axes,) = plots.path(different.isel(run=[1])).axes
+    assert tuple(axes.patches[0].center) == (2, 1)
+
+
 def test_failures_are_shown():
     """A failed run keeps its place in the legend and is marked where it ended."""
     result = fail(make(("none", "fel", "fel")), 1, 3.0)
