@@ -206,6 +206,8 @@ def compare_errors(
 ) -> Figure:
     """Draws tracking errors of two controllers in the same axes, with their RMS values (the paper's figure 5).
 
+    The RMS is over the samples that are drawn of all runs; it gives way to a word where one of them failed in view.
+
     Args:
         result_pid: Runs of the first controller, in the paper conventional PID.
         result_nn: Runs of the second controller, in the paper PID with neural feedforward.
@@ -222,8 +224,7 @@ def compare_errors(
     for axes, name in zip(figure.axes, ERRORS, strict=True):
         for row, label in enumerate(labels):
             colour = colours[row]
-            squares = np.concatenate([np.square(data[name].values) for data, other, _ in curves if other == label])
-            text = f"RMS {MILLI * np.sqrt(squares.mean()):.2g}" if np.isfinite(squares).all() else "failed"
+            text = _rms([data for data, other, _ in curves if other == label], name)
             axes.text(1 - 0.26 * (1 - row), 1.0, text, color=colour, fontsize=8, ha="right", va="bottom",
                       transform=axes.transAxes)  # fmt: skip
     return figure
@@ -481,6 +482,16 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
                 if column == channel == 0:
                     panel.set_ylabel(f"{name}\n$\\dot\\theta$ (rad/s)")
     return figure
+
+
+def _rms(runs: Sequence[xr.Dataset], name: str) -> str:
+    """Returns in words the RMS of an error over runs, or that one failed; NaN that pad a shorter run do not count."""
+    errors = [run[name].values for run in runs]
+    finite = [np.isfinite(one) for one in errors]
+    if any(run.get("failed", True) and not fine.all() for run, fine in zip(runs, finite, strict=True)):
+        return "failed"
+    squares = np.concatenate([np.square(one[fine]) for one, fine in zip(errors, finite, strict=True)])
+    return f"RMS {MILLI * np.sqrt(squares.mean()):.2g}" if len(squares) else "RMS –"
 
 
 def _finished(values: Array, failed: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:

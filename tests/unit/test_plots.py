@@ -163,6 +163,23 @@ def test_compare_errors():
     assert failed.axes[0].texts[1].get_text() == "failed" and legend(failed)[1].endswith("(failed)")
 
 
+def test_compare_errors_of_shorter_runs():
+    """A run that arrived, or that is shorter, has the RMS of its samples; only one that failed in view is said to."""
+    result = make()
+    result["lateral_error"][:] = 0.002
+    padded = result.copy(deep=True)
+    for name in metrics.SAMPLED:
+        padded[name][1, 200:] = np.nan
+    pid, nn = padded.isel(run=[0]), padded.isel(run=[1])
+    texts = lambda figure: [text.get_text() for text in figure.axes[1].texts]  # noqa: E731
+    assert texts(plots.compare_errors(pid, nn)) == ["RMS 2", "RMS 2"]
+    assert texts(plots.compare_errors(pid, nn, window=(5, 6))) == ["RMS 2", "RMS –"]
+    assert texts(plots.compare_errors(pid, nn.drop_vars("failed"))) == ["RMS 2", "failed"]
+    both = fail(padded, 1, 3.0)
+    assert texts(plots.compare_errors(pid, both, window=(0, 2))) == ["RMS 2", "RMS 2"]  # before it failed
+    assert texts(plots.compare_errors(pid, both)) == ["RMS 2", "failed"]
+
+
 def test_learning_curve():
     """The metric of each run lap by lap, its mean by label, on a log axis, the lines named at their ends."""
     result = make(("fel", "none", "fel"))
