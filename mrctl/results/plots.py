@@ -273,10 +273,10 @@ def feedforward_outputs(
 
 @styled
 def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omega_rmse")) -> Figure:
-    """Draws metrics lap by lap on a log axis, with a thin line for each run and a thick one for the mean of each label.
+    """Draws metrics lap by lap, with a thin line for each run and a thick one for the mean of each label.
 
-    The mean is over the runs that finished, so that it is over the same runs in each lap; where none of a label
-    finished, it is over the laps that all of them drove.
+    The axis is logarithmic where all values are positive. The mean is over the runs that finished, so that it is over
+    the same runs in each lap; where none of a label finished, it is over the laps that all of them drove.
 
     Args:
         result: What `simulate` or `metrics.per_lap` returns.
@@ -313,9 +313,9 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
             one.plot(number[whole], mean, "o-", ms=2.5, lw=1.2, color=colour)
             at = (number[whole][-1], mean[-1]) if whole.any() else (number[0], np.nan)
             ends.append((float(at[0]), float(at[1]), _counted(label, int(failed.sum()), len(rows)), colour))
-        one.set(title=text, yscale="log")
+        one.set_title(text)
         one.xaxis.get_major_locator().set_params(integer=True)
-        _plain(one)
+        _scale(one, laps[name].values)
         _label_ends(one, ends)
     for one in axes[max(0, len(names) - columns) : len(names)]:  # the lowest of each column
         one.set_xlabel("lap")
@@ -325,10 +325,11 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
 
 @styled
 def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence[int] = ()) -> Figure:
-    """Draws a metric lap by lap on a log axis, in a panel for each case: mean and range of the runs that share a label.
+    """Draws a metric lap by lap, in a panel for each case: mean and range of the runs that share a label.
 
-    Mean and range are over the runs that finished, so that they are over the same runs in each lap; where none of a
-    label finished, they are over the laps that all of them drove. The legend says how many failed, in all cases.
+    The axis is logarithmic where all values are positive. Mean and range are over the runs that finished, so that they
+    are over the same runs in each lap; where none of a label finished, they are over the laps that all of them drove.
+    The legend says how many failed, in all cases.
 
     Args:
         cases: Datasets as `metrics.per_lap` returns them, by title.
@@ -359,9 +360,9 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
                 one.plot(number[whole], mean, marker=".", ms=3, **line)
         for lap in changes:
             one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
-        one.set(title=title, yscale="log")
+        one.set_title(title)
         one.xaxis.get_major_locator().set_params(integer=True)
-        _plain(one)
+        _scale(one, np.concatenate([laps[metric].values.ravel() for laps in cases.values()]))
     for place, one in enumerate(axes):
         one.set_xlabel("lap" if place + columns >= len(cases) else "")
         one.tick_params(labelbottom=place + columns >= len(cases))
@@ -673,17 +674,22 @@ class _Plain(LogFormatterSciNotation):
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
-def _plain(axes: Axes) -> None:
+def _scale(axes: Axes, values: Array) -> None:
+    """Makes the vertical axis logarithmic, with plain numbers, unless a value is zero or negative."""
+    if (values <= 0).any():
+        return
+    axes.set_yscale("log")
     axes.yaxis.set_major_formatter(_Plain())
     axes.yaxis.set_minor_formatter(_Plain(minor_thresholds=(2, 0.5)))
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
     """Names each line at its end, spread so that no two names overlap."""
-    low, high = np.log10(axes.get_ylim())
+    scaled = axes.yaxis.get_transform().transform
+    low, high = scaled(np.array(axes.get_ylim()))
     gap = 0.075  # share of the axis that a line of 8 pt takes in a panel of 50 mm
-    shown = sorted((e for e in ends if np.isfinite(e[1]) and e[1] > 0), key=lambda end: end[1])
-    heights = np.array([(np.log10(y) - low) / (high - low) for _, y, _, _ in shown])
+    shown = sorted((e for e in ends if np.isfinite(e[1])), key=lambda end: end[1])
+    heights = (scaled(np.array([y for _, y, _, _ in shown])) - low) / (high - low)
     places = heights.copy()
     for _ in range(200):
         short = gap - np.diff(places)

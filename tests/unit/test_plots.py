@@ -181,7 +181,7 @@ def test_compare_errors_of_shorter_runs():
 
 
 def test_learning_curve():
-    """The metric of each run lap by lap, its mean by label, on a log axis, the lines named at their ends."""
+    """The metric of each run lap by lap, its mean by label, on a log axis if positive, each line named at its end."""
     result = make(("fel", "none", "fel"))
     laps = metrics.per_lap(result)
     for source in (result, laps):
@@ -191,6 +191,28 @@ def test_learning_curve():
         for line in (value[0], value[2], (value[0] + value[2]) / 2, value[1]):
             assert drawn(left, [1, 2, 3], line)
         assert sorted(text.get_text() for text in left.texts) == ["fel", "none"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_metrics_that_are_zero():
+    """A metric that is zero has a linear axis, on which its lines are drawn and named."""
+    result = make()
+    result["saturated"][:] = np.array([0.0, 1.0])[:, None]
+    laps = metrics.per_lap(result)
+    zero, some, positive = plots.learning_curve(laps, ["guard_actions", "saturation_time", "energy"]).axes[:3]
+    zero.figure.canvas.draw()
+    assert [axes.get_yscale() for axes in (zero, some, positive)] == ["log", "linear", "log"]
+    laps["guard_actions"][:] = 0.0
+    zero, some, positive = plots.learning_curve(laps, ["guard_actions", "saturation_time", "energy"]).axes[:3]
+    zero.figure.canvas.draw()
+    assert [axes.get_yscale() for axes in (zero, some, positive)] == ["linear", "linear", "log"]
+    for axes in (zero, some):
+        assert sorted(text.get_text() for text in axes.texts) == ["fel", "none"]
+        heights = [text.xyann[1] for text in axes.texts]
+        assert min(heights) > 0 and max(heights) < 1 and abs(np.diff(heights)) > 0.07
+    figure = plots.laps_by_case({"one": laps, "other": metrics.per_lap(result)}, "saturation_time")
+    figure.canvas.draw()
+    assert [axes.get_yscale() for axes in figure.axes] == ["linear", "linear"]
 
 
 def test_titles_fit_their_panels():
