@@ -425,6 +425,16 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     return table
 
 
+def shown_unit(unit: str) -> tuple[float, str]:
+    """Returns the factor by which figures and pages show a quantity with a unit, and the unit that they show.
+
+    What is in m or rad, as errors are, is shown in thousandths; "" stands for no unit.
+    """
+    if unit == "1":
+        return 1.0, ""
+    return (1e3, f"m{unit}") if unit.startswith(("m", "rad")) else (1.0, unit)
+
+
 def known(metric: str) -> str:
     """Returns the name if it is one of `METRICS`.
 

@@ -30,7 +30,7 @@ from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
 from mrctl.results.dataset import check_kind, scenarios_of
-from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
+from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap, shown_unit
 from mrctl.theory.obstacles import Obstacles, turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 
@@ -579,12 +579,10 @@ def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -
 
 
 def _shown(metric: str) -> tuple[float, str]:
-    """Returns the factor by which a metric is drawn, and its description with the unit; errors are in thousandths."""
+    """Returns the factor by which a metric is drawn, and its description with the unit."""
     unit, text = METRICS[metric]
-    if unit == "1":
-        return 1.0, text
-    milli = unit.startswith(("m", "rad"))
-    return (MILLI if milli else 1.0), f"{text} ({'m' * milli}{unit})"
+    factor, unit = shown_unit(unit)
+    return factor, f"{text} ({unit})" if unit else text
 
 
 def _plant(*results: xr.Dataset) -> str:

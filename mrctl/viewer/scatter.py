@@ -14,7 +14,7 @@ from viser import uplot
 
 from mrctl.record import InputError
 from mrctl.results.controllers import CONTROLLER_FIELDS, title_of
-from mrctl.results.metrics import METRICS
+from mrctl.results.metrics import METRICS, shown_unit
 from mrctl.viewer.looks import Colour, looks
 from mrctl.viewer.page import block
 from mrctl.viewer.plots import CURSOR_COLOUR
@@ -197,7 +197,5 @@ def numbers_of(table: pd.DataFrame) -> list[str]:
 def in_words(column: str) -> tuple[float, str]:
     """Returns the factor on a column's values, and its name in words with the unit; errors are in mm, as in figures."""
     unit, text = METRICS.get(column, KNOWN_COLUMNS.get(column, ("1", column.replace(".", ", ").replace("_", " "))))
-    if unit == "1":
-        return 1.0, text
-    milli = unit.startswith(("m", "rad"))
-    return (1e3 if milli else 1.0), f"{text}, {'m' * milli}{unit}"
+    factor, unit = shown_unit(unit)
+    return factor, f"{text}, {unit}" if unit else text

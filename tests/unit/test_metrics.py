@@ -11,6 +11,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import save
 from mrctl.theory.references import Circle, Lemniscate
+from mrctl.viewer.scatter import in_words
 
 DT, LAP = 0.01, 2.0
 
@@ -333,3 +334,16 @@ def test_over_laps_and_excess():
         metrics.over_laps(laps, "energy")
     with pytest.raises(InputError, match="^change: lap 5 and lap 4"):
         metrics.excess(laps, "position_rmse", 5, 4)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "shown"),
+    [("m", 1e3, "mm"), ("rad/s", 1e3, "mrad/s"), ("m s", 1e3, "mm s"), ("V", 1.0, "V"), ("1", 1.0, "")],
+)
+def test_shown_units(unit, factor, shown):
+    """Lengths and angles are shown in thousandths, by figures and pages alike; a number without a unit as it is."""
+    assert metrics.shown_unit(unit) == (factor, shown)
+    name = next(name for name, (own, _) in metrics.METRICS.items() if own == unit)
+    text = metrics.METRICS[name][1]
+    assert plots._shown(name) == (factor, f"{text} ({shown})" if shown else text)
+    assert in_words(name) == (factor, f"{text}, {shown}" if shown else text)
