@@ -105,8 +105,7 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
             "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve ends "
             "below 1 by the share of runs that it or PID alone lost.",
         )
-    learners = [name for name in choices if name not in WITHOUT_MAP]
-    if learners:
+    if learners := with_map(choices):
         drawn["inverse_dynamics"] = (
             plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
             "Maps that the feedforwards learned with four things wrong at once (all), beside the true inverse dynamics "
@@ -120,6 +119,16 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
     """Returns the runs of one case in one dataset, labelled with their feedforwards."""
     own = [one.assign_coords(label=("run", [name] * one.sizes["run"])) for name, one in runs.items()]
     return xr.concat([one.drop_vars("scenario", errors="ignore") for one in own], "run")
+
+
+def with_map(choices: Choices) -> list[str]:
+    """Returns the names of the choices that learn a map: a user's controller does if it has a feedforward."""
+    stages = {name: user_files.split(one.controller) for name, one in choices.items() if one.controller}
+    return [
+        name
+        for name in choices
+        if name not in WITHOUT_MAP and (name not in stages or any(part.stage == "feedforward" for part in stages[name]))
+    ]
 
 
 def learned(choice: Choice, scenario: Scenario) -> InverseMap:

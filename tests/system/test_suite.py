@@ -25,7 +25,7 @@ from scipy import stats
 import mrctl
 from mrctl import cli
 from mrctl.experiments import held_out, report, suite, suite_tables, tuning
-from mrctl.experiments.cases import Case
+from mrctl.experiments.cases import Case, Choice
 from mrctl.loop.hindsight import best_fixed
 from mrctl.results import metrics, plots
 from mrctl.sweep import jobs
@@ -440,6 +440,14 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("plain")
+def test_maps_are_those_of_feedforwards() -> None:
+    """A heat map is drawn of what learns one: not of PID, the model, or a user's controller without a feedforward."""
+    own = {"Gain": "/a.py:Gain", "Pursuit": "motion=/a.py:Pursuit", "Both": "motion=/a.py:Pursuit,feedforward=/b.py:B"}
+    choices = suite.by_name(("none", "model", "true_model", "model+l1", "fel", "model+rls", "hindsight"), ())
+    choices = {**choices, **{name: Choice(controller=controller) for name, controller in own.items()}}
+    assert report.with_map(choices) == ["fel", "model+rls", "Gain", "Both"]
+
+
 def test_controller_with_the_model(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """With `model+` in front it adds to the nominal model, as with that prior in `simulate`; the page repeats that."""
     file, out = tmp_path / "mine.py", tmp_path / "suite"
