@@ -65,6 +65,9 @@ SOURCES: dict[str, tuple[str, ...]] = {
 }
 """The commands whose output is each input of this one; each ends with where it writes."""
 
+ENDED_FILE = "ended.jsonl"
+"""Name of the log of the commands that ended with status 0: a line for each, with the version of mrctl."""
+
 Table = Mapping[str, Any]
 
 
@@ -139,7 +142,7 @@ def main(
 
 
 def drive(folder: Path) -> dict[str, tuple[Path, ...]]:
-    """Runs the commands of `SOURCES` in a folder, but those that this version has ended there.
+    """Runs the commands of `SOURCES` in a folder, but those that this version has ended there without an error.
 
     Returns:
         The folders and files that they wrote, by input of `main`.
@@ -153,12 +156,18 @@ def drive(folder: Path) -> dict[str, tuple[Path, ...]]:
 
 
 def _driven(folder: Path, command: str) -> Path:
-    """Runs a command of `SOURCES`, if this version has not; returns where it wrote."""
+    """Runs a command of `SOURCES`, unless this version has and it ended with status 0; returns where it wrote.
+
+    The log says how it ended: a command that drives several parts writes a table after the first, and one that set jobs
+    aside writes tables too.
+    """
     words = command.split()
-    place = folder / words[-1]
+    place, log = folder / words[-1], folder / ENDED_FILE
+    ended = json.dumps({"command": command, "mrctl": __version__})
     with suppress(OSError, ValueError, LookupError):
         table = json.loads((place if place.suffix else place / "table.json").read_text())
-        if (table.get("versions") or table["machine"])["mrctl"] == __version__:
+        written = (table.get("versions") or table["machine"])["mrctl"]
+        if written == __version__ and ended in log.read_text().splitlines():
             return place
     print(f"mrctl {command}", flush=True)
     shown = subprocess.PIPE if ">" in words else None
@@ -168,6 +177,8 @@ def _driven(folder: Path, command: str) -> Path:
         raise InputError(f"everything: mrctl {command} ended with status {done.returncode}")
     if shown:
         place.write_bytes(done.stdout)
+    with log.open("a") as file:
+        file.write(f"{ended}\n")
     return place
 
 

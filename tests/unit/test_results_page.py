@@ -197,6 +197,15 @@ def test_everything(
     monkeypatch.setattr(results_page, "SOURCES", {**sources, "held_out": ("suite --held-out none --out held_out",)})
     shutil.copytree(suite, tmp_path / "all" / "suite")  # of this version
     shutil.copytree(reproduction, tmp_path / "all" / "reproduction")  # of another
+    part = tmp_path / "all" / sources["navigate"][0].split()[-1] / "table.json"  # the first part of three
+    part.parent.mkdir(parents=True)
+    part.write_text((navigated / "table.json").read_text())
+    lines = [
+        json.dumps({"command": own, "mrctl": mrctl.__version__})
+        for name in ("suite", "reproduce")
+        for own in sources[name]
+    ]
+    (tmp_path / "all" / results_page.ENDED_FILE).write_text("\n".join([*lines, ""]))
     ran, failing = [], "suite --held-out"
 
     def run(words: list[str], cwd: Path, stdout: int | None, **_: object) -> subprocess.CompletedProcess:
@@ -214,6 +223,10 @@ def test_everything(
     assert results_page.command(words) == 2
     assert "mrctl suite --held-out none --out held_out ended with status 1" in capsys.readouterr().err
     assert len(ran) == len(sources) and ran[0] == "reproduce --out reproduction" and "suite --out suite" not in ran
+    assert sources["navigate"][0] in ran  # it did not end
+    before = len(ran)
+    assert results_page.command(words) == 2
+    assert ran[before:] == ["reproduce --out reproduction", "suite --held-out none --out held_out"]
 
 
 @pytest.mark.parametrize("source", [*results_page.SOURCES, "mppi", "limits"])
