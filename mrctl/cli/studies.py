@@ -10,7 +10,7 @@ import tyro
 
 from mrctl.cli.shared import Incomplete, check_exists, check_workers, expect_all
 from mrctl.record import InputError
-from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName
+from mrctl.scenario import FeedforwardName
 
 
 def sweep(
@@ -85,13 +85,12 @@ def suite(
             raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
         return _judge_held_out(held_out, seeds, workers, out or Path("held_out"))
     from mrctl.experiments import suite as uncertainty
-    from mrctl.experiments.cases import HINDSIGHT, RANDOM, REPLICATES, Mode
+    from mrctl.experiments.cases import RANDOM, REPLICATES, Mode, entries
 
     mode: Mode = "quick" if quick else "full" if full else "core"
     folder = out or Path("suite" if mode == "core" else f"suite_{mode}")
-    every = (*(FEEDFORWARDS if full else COMPARED), HINDSIGHT)
     counts = (REPLICATES[mode] if seeds is None else seeds), (RANDOM[mode] if random is None else random)
-    compared = every if feedforward is None else feedforward
+    compared = entries(mode) if feedforward is None else feedforward
     aside = uncertainty.suite(mode, compared, controller, *counts, workers, folder).aside
     print(f"{(folder / 'table.md').read_text()}\nReport: {folder / 'report.html'}")
     expect_all(aside)

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from mrctl.control.pid import Pid
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.scenario import Event, Scenario, replicates
+from mrctl.scenario import COMPARED, FEEDFORWARDS, Event, FeedforwardName, Scenario, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, StopAndGo, Waypoints, random_spline
@@ -22,7 +22,7 @@ from mrctl.theory.timing import Limits
 
 SUITE_SEEDS, TUNING_SEEDS, HELD_OUT_SEEDS = range(100_000), range(100_000, 200_000), range(200_000, 300_000)
 """Seeds of the suite, of the worlds in which settings are tuned, and of the held-out cells, on which none is chosen."""
-HINDSIGHT = "hindsight"  # the best fixed feedforward, found by repeating the run
+HINDSIGHT: Literal["hindsight"] = "hindsight"  # the best fixed feedforward, found by repeating the run
 REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant or the run, and so are no competitors
 LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants that every steering arrangement drives
 UNCERTAIN = (
@@ -130,6 +130,14 @@ def loop() -> Waypoints:
 Mode = Literal["quick", "core", "full"]
 REPLICATES: dict[Mode, int] = {"quick": 3, "core": 20, "full": 20}
 RANDOM: dict[Mode, int] = {"quick": 6, "core": 30, "full": 1000}
+Entry = FeedforwardName | Literal["hindsight"]
+"""A feedforward of mrctl, or the best fixed one for each run."""
+
+
+def entries(mode: Mode) -> tuple[Entry, ...]:
+    """Returns what the suite compares by default."""
+    return (*(FEEDFORWARDS if mode == "full" else COMPARED), HINDSIGHT)
+
 
 PARTS = {
     "steady": "One thing wrong from the start, or four at once",

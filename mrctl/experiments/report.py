@@ -193,11 +193,16 @@ def command(outcome: Outcome, choices: Choices) -> str:
     """Returns the command that repeats the suite."""
     words = ["mrctl", "suite", *([f"--{outcome.mode}"] if outcome.mode != "core" else [])]
     words += ["--feedforward", *(name for name, one in choices.items() if not one.controller)]
-    own = [named(one.prior, one.controller) for one in choices.values() if one.controller]
+    own = controllers(choices)
     words += ["--controller", *own] if own else []
     words += ["--seeds", str(len(next(case for case in outcome.cases if case.part != "random").scenarios))]
     words += ["--random", str(_worlds(outcome))]
     return shlex.join(words)
+
+
+def controllers(choices: Choices) -> list[str]:
+    """Returns the user's controllers, as on the command line."""
+    return [named(one.prior, one.controller) for one in choices.values() if one.controller]
 
 
 def _worlds(outcome: Outcome) -> int:

@@ -11,6 +11,7 @@ and the paragraphs that people wrote about the tables survive.
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ from mrctl import __version__
 from mrctl.experiments import bench as benchmark
 from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
-from mrctl.experiments.cases import REPLICATES
+from mrctl.experiments.cases import RANDOM, REPLICATES, entries
 from mrctl.experiments.held_out import LOG_FILE
 from mrctl.experiments.suite_tables import COLUMNS, column_title, interval, titled
 from mrctl.experiments.tables import markdown, number, output_folder
@@ -311,17 +312,35 @@ def _paper_section(folder: Path) -> str:
 
 def _suite_section(folder: Path) -> str:
     table = _read(folder / "table.json", "rows", "mode")
-    flag = "" if table["mode"] == "core" else f" --{table['mode']}"
-    if (count := min(row["runs"] for row in table["rows"])) != REPLICATES[table["mode"]]:
-        flag += f" --seeds {count}"
-    return _section(f"mrctl suite{flag}", table, suite_text(table, _text(folder / "table.md")))
+    return _section(_suite_command(table), table, suite_text(table, _text(folder / "table.md")))
+
+
+def _suite_command(table: Table) -> str:
+    """Returns the command that wrote a table of `mrctl suite`, without the flags that have their defaults."""
+    mode, rows = table["mode"], table["rows"]
+    seeds, random = (
+        max((row["runs"] for row in rows if (row["part"] == "random") == which), default=0) for which in (False, True)
+    )
+    flags = f" --seeds {seeds}" if seeds != REPLICATES[mode] else ""
+    flags += f" --random {random}" if random != RANDOM[mode] else ""
+    return f"{_compared(table, rows)}{flags}"
+
+
+def _compared(table: Table, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the command `mrctl suite` with its mode and, unless it compared what it does by default, what it did."""
+    mode, every = table["mode"], entries("full")
+    named = tuple(dict.fromkeys(row["feedforward"] for row in rows if row["feedforward"] in every))
+    words = ["mrctl", "suite", *([f"--{mode}"] if mode != "core" else [])]
+    words += ["--feedforward", *named] if named != entries(mode) else []
+    words += ["--controller", *own] if (own := table.get("controllers")) else []
+    return shlex.join(words)
 
 
 def _random_section(folder: Path) -> str:
     table = _read(folder / "table.json", "rows", "mode")
-    names, count = (list(dict.fromkeys(row[k] for row in _random(table))) for k in ("feedforward", "runs"))
-    flags = f"--{table['mode']} --feedforward {' '.join(names)} --random {max(count)}"
-    return _section(f"mrctl suite {flags}", table, random_text(_text(folder / "table.md")))
+    rows = _random(table)
+    command = f"{_compared(table, rows)} --random {max(row['runs'] for row in rows)}"
+    return _section(command, table, random_text(_text(folder / "table.md")))
 
 
 def _held_out_section(folder: Path) -> str:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -26,6 +26,7 @@ from mrctl.experiments.cases import (
     Case,
     Choice,
     Choices,
+    Entry,
     Laps,
     Mode,
     Outcome,
@@ -41,13 +42,12 @@ from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, named, replicates
+from mrctl.scenario import FEEDFORWARDS, Scenario, named, replicates
 from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 from mrctl.sweep.store import Store
 from mrctl.theory.references import Circle
 
-Entry = FeedforwardName | Literal["hindsight"]
 Errors = Mapping[str, Mapping[str, Array]]
 RUNS_PER_JOB = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
 # s for the start of a feedforward's workers, and for a row of the tables; measured
@@ -94,8 +94,8 @@ def suite(
     outcome = Outcome(mode, chosen, laps, runs, rows, aside)
     shown = tables(rows, mode)
     (out / "table.md").write_text("\n".join(one.markdown for one in shown))
-    found = {"versions": versions(), "machine": machine(), "mode": mode, "rows": rows, "runs": each_run(runs)}
-    write_json(out / "table.json", found)
+    found = {"versions": versions(), "machine": machine(), "mode": mode, "controllers": report.controllers(choices)}
+    write_json(out / "table.json", found | {"rows": rows, "runs": each_run(runs)})
     report.write(outcome, choices, shown, out)
     return outcome
 

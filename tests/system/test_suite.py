@@ -435,7 +435,7 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     scenarios = next(case.scenarios for case in tiny("core", 2, 3) if case.name == "all")
     alone = mrctl.summary(mrctl.simulate(list(scenarios), feedforward=namespace["Gain"]))
     assert row["v_rmse"]["value"] == pytest.approx(alone["v_rmse"].mean(), rel=1e-12)
-    assert "Gain" in (out / "report.html").read_text()
+    assert "Gain" in (out / "report.html").read_text() and table["controllers"] == [f"{file}:Gain"]
     assert content(whole)["runs/rls/runs.parquet"] == content(out)["runs/rls/runs.parquet"]
 
 

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 import mrctl
 from mrctl import cli
 from mrctl.experiments import bench, identify, paper, results_page, tuning
+from mrctl.experiments.cases import entries
 from mrctl.experiments.tables import machine, write_json
 from mrctl.results.dataset import versions
 
@@ -33,8 +35,8 @@ def suite(tmp_path: Path) -> Path:
     error = {"value": 0.0123, "low": 0.0121, "high": 0.0125, "samples": 2}
     lost = error | {"value": float("nan"), "samples": 0}
     rows = [
-        {"case": case, "feedforward": name, "failed": 2 * (e is lost), "runs": 2, "v_rmse": e, "omega_rmse": e,
-         "position_rmse": e}
+        {"part": "steady", "case": case, "feedforward": name, "failed": 2 * (e is lost), "runs": 2, "v_rmse": e,
+         "omega_rmse": e, "position_rmse": e}
         for case, name, e in (("nominal", "none", error), ("slope 10°", "fel", error), ("all", "fel", lost))
     ]  # fmt: skip
     return written(tmp_path / "suite", {"rows": rows, "mode": "full"}, TABLES)
@@ -147,7 +149,8 @@ def test_sections(
     assert "| nominal | PID         | 0/2    | 12.3 [12.1, 12.5] |" in short and "slope" not in short
     assert "| all     | fel         | 2/2    | –  " in short
     assert (
-        "`mrctl suite --full --seeds 2` made this" in short and "- Steady. All tie.\n- A step. `rls` is back." in short
+        "`mrctl suite --full --feedforward none fel --seeds 2 --random 0` made this" in short
+        and "- Steady. All tie.\n- A step. `rls` is back." in short
     )
     assert [text.split("</summary>")[0] for text in folded] == ["<summary>Steady", "<summary>A step"]
     assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
@@ -256,8 +259,26 @@ def test_random_worlds(suite: Path, tmp_path: Path) -> None:
     found = results_page.sections(out.read_text())["Random worlds"]
     assert found.startswith(f"`mrctl suite --full --feedforward none fel --random 9` made this {MADE}")
     assert found.endswith("fel wins.\n\n| world |\n| --- |")
-    (folder / "table.json").write_text((suite / "table.json").read_text().replace('"case"', '"part": "one", "case"'))
+    (folder / "table.json").write_text((suite / "table.json").read_text())
     assert results_page.command(["--random", str(folder), "--out", str(out)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("mode", "names", "runs", "controllers", "command"),
+    [
+        ("core", entries("core"), (20, 30), [], "mrctl suite"),
+        ("full", entries("full"), (20, 1000), [], "mrctl suite --full"),
+        ("core", entries("core"), (50, 30), [], "mrctl suite --seeds 50"),  # not the number of random worlds
+        ("quick", entries("quick"), (3, 0), [], "mrctl suite --quick --random 0"),
+        ("core", ("none", "fel"), (20, 8), [], "mrctl suite --feedforward none fel --random 8"),
+        ("core", ("none", "Gain"), (20, 30), ["a.py:Gain"], "mrctl suite --feedforward none --controller a.py:Gain"),
+    ],
+)
+def test_command_of_a_suite(mode: str, names: Any, runs: Any, controllers: list[str], command: str) -> None:
+    """The command above the tables drives the same runs: replicates, random worlds, and what is compared."""
+    parts = [(part, count) for part, count in zip(("steady", "random"), runs, strict=True) if count]
+    rows = [{"part": part, "feedforward": name, "runs": count} for part, count in parts for name in names]
+    assert results_page._suite_command({"mode": mode, "rows": rows, "controllers": controllers}) == command
 
 
 def test_other_sections_stay(figures: Path, tmp_path: Path) -> None:
