@@ -126,7 +126,7 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
         laps, aside = suite.run(chosen, choices, workers, out / "runs")
     rows = compare(name, suite.runs_of(chosen, laps))
     tables = summarised(name, rows, count)
-    if fresh:
+    if fresh or not _said(out, entry):
         _log(out, logged | {"says": tables[0].says})
     (out / "table.md").write_text("\n".join(table.markdown for table in tables))
     source = {"versions": versions(), "machine": machine()}
@@ -138,6 +138,13 @@ def _log(out: Path, values: Mapping[str, Any]) -> None:
     """Adds a line to the log, so that a drive that was begun is on record even without a result."""
     with (out / LOG_FILE).open("a") as file:
         file.write(json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values}) + "\n")
+
+
+def _said(out: Path, entry: str) -> bool:
+    """Tells whether the last line of the log on a feedforward has its result, and not only that a drive was begun."""
+    log, of_entry = out / LOG_FILE, f'"entry": {json.dumps(entry)}'
+    own = [line for line in log.read_text().splitlines() if of_entry in line] if log.exists() else []
+    return bool(own) and '"says": ' in own[-1]
 
 
 def _half(cell: Case) -> Case:
