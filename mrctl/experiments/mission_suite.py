@@ -56,7 +56,7 @@ MAX_WORLDS_PER_DRAW = 10  # worlds that are made, over the number of draws
 CRITICAL_SHARE = 0.95
 DRAWS = {"quick": 20, "core": 80}  # with fewer than 72 the interval of a critical width has no upper end
 POSE_STRIDE = 2  # control periods between the poses whose widths are looked at
-TIE = 1e-3  # m
+TIE = 1e-3  # m, difference of widths that counts as a tie
 SIMULATED_PER_SECOND = 100  # simulated s in a s of one core, planning included
 
 
@@ -265,8 +265,8 @@ def critical_widths(found: Found, shown: str) -> Table:
     says = (
         f"At 95 % success the plans themselves need {_quantile(found.plans, 1e3)} mm; corridors left out because no "
         f"plan goes through: {found.impassable}. In paired draws, with 95 % "
-        f"confidence and differences up to {1e3 * TIE:.0f} mm as ties: {_against('none', needed)}; "
-        f"{_against('model', needed)}."
+        f"confidence and differences up to {1e3 * TIE:.0f} mm as ties: {_against('none', needed, TIE)}; "
+        f"{_against('model', needed, TIE)}."
     )
     return Table(f"Critical width of a corridor at {found.speeds[-1]:.2f} m/s ({shown})", says, frame(rows, header))
 
@@ -284,7 +284,7 @@ def critical_speeds(found: Found, shown: str) -> Table:
     header = ["plant", "controller", "critical speed, m/s", "success up to each speed"]
     says = (
         f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
-        f"In paired draws, with 95 % confidence: {_against('none', -critical)}; {_against('model', -critical)}."
+        f"In paired draws, with 95 % confidence: {_against('none', -critical, 0)}; {_against('model', -critical, 0)}."
     )
     return Table(f"Critical speed with an allowance of {1e3 * ALLOWANCE:.0f} mm ({shown})", says, frame(rows, header))
 
@@ -329,17 +329,18 @@ def _text(value: float) -> str:
     return "∞" if value == np.inf else "–" if not np.isfinite(value) else number(value, 4) if value else "0"
 
 
-def _against(rival: FeedforwardName, samples: Array) -> str:
+def _against(rival: FeedforwardName, samples: Array, floor: float) -> str:
     """Returns in words who beats or loses to a rival, and where.
 
     Args:
         rival: The rival.
         samples: What they need, `(controllers, plants, draws)`; less is better.
+        floor: Largest difference that counts as a tie, in the unit of the samples.
     """
     verdicts = {"better": [], "worse": []}
     for c, name in enumerate(CONTROLLERS):
         for p, plant in enumerate(PLANTS):
-            wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=TIE)
+            wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=floor)
             if name != rival and (wins.low > 0.5 or wins.high < 0.5):
                 verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{titled(name)}` ({plant})")
     parts = [f"{word} than `{titled(rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names]

@@ -114,6 +114,20 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     )
 
 
+def test_ties_of_critical_speeds() -> None:
+    """The tie of widths is none of speeds: also one that is 0.5 mm/s larger is larger."""
+    size = len(suite.CONTROLLERS), len(suite.PLANTS), 10
+    needed = np.zeros((2, *size))
+    needed[1] = 1.0
+    needed[1, suite.CONTROLLERS.index("fel")] = 0.0  # it alone passes at the larger speed too
+    found = suite.Found(needed, *(np.zeros(size) for _ in range(3)), np.zeros(10), [0.5, 0.5005], 0)
+    listed = ", ".join(f"`fel` ({plant})" for plant in suite.PLANTS)
+    says = suite.critical_speeds(found, "car").says
+    assert f"better than `PID` are {listed}; better than `model` are {listed}." in says
+    found = found._replace(needed=needed[::-1] * 5e-4)
+    assert "none differs from `PID`; none differs from `model`." in suite.critical_widths(found, "car").says
+
+
 def test_learned_limits() -> None:
     """What is learned on a robot that is half as heavy again and has a weak supply is what its equations say."""
     wrong = Perturbation(mass_factor=1.5, supply_factor=0.8)
