@@ -173,13 +173,13 @@ def reading(header: Sequence[str]) -> str:
         "Below PID, or below `model`, is the share of runs in which the error of the last lap is less than that of PID "
         "alone, or of `model`, in the same run: 1.00 is all runs, 0.50 is no difference, a tie counts half, and a "
         "failed run loses. The three shares are those for V, θ̇ and position; the brackets hold the "
-        "95 % interval of the share for position. Guard acted is the mean number of times in a run."
+        "95 % interval of the share for position, given the ties. Guard acted is the mean number of times in a run."
     ]
     if HARMLESS in header:
         found.append(
             f"At most {NO_WORSE:g}× PID is the share of runs whose error is at most so many times that of PID alone, "
-            "with the brackets as before. Position over PID is the 99 % quantile of that ratio; then comes the number "
-            f"of runs in which it is above {MUCH_WORSE:g}."
+            "with Wilson's 95 % interval of the share for position in brackets. Position over PID is the 99 % quantile "
+            f"of that ratio; then comes the number of runs in which it is above {MUCH_WORSE:g}."
         )
     if CONVERGED in header:
         found.append(

@@ -75,7 +75,7 @@ def share_cell(count: int, total: int) -> str:
 
 
 def wins_cell(wins: Superiority) -> str:
-    """Returns the share of paired runs that one wins, with its interval."""
+    """Returns the share of paired runs that one wins, ties as half, with its interval given the ties."""
     return f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]"
 
 

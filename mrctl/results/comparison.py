@@ -46,7 +46,7 @@ class Ratio(NamedTuple):
 
 
 class Superiority(NamedTuple):
-    """The probability that A beats B in the same run, ties as half, with its confidence interval, over all pairs."""
+    """The probability that A beats B in the same run, ties as half over all pairs, and its interval given the ties."""
 
     value: float
     low: float
@@ -118,7 +118,8 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
 
     The interval holds ½ only if the two-sided sign test, which leaves out ties, does not tell A and B apart: it is the
     exact interval (Clopper and Pearson 1934) of the share of wins among the pairs that are not ties, whose number is
-    taken as given. Where all pairs are ties, it allows for the largest share of other pairs that may remain unseen.
+    taken as given. So with ties it is no interval of the probability itself, as it leaves out that their number varies.
+    Where all pairs are ties, it allows for the largest share of other pairs that may remain unseen.
 
     Args:
         a: One number a run (n,); NaN or infinite where it failed.

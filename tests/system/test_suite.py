@@ -477,7 +477,7 @@ def test_columns_say_what_they_are(whole: Path) -> None:
     exact = stats.binomtest(won["wins"], 3).proportion_ci(method="exact")  # of the share in position, not of an error
     assert (won["low"], won["high"]) == pytest.approx((exact.low, exact.high), rel=1e-9)
     title = "share of runs below model: V / θ̇ / position [interval of position]"
-    meaning = "the brackets hold the 95 % interval of the share for position"
+    meaning = "the brackets hold the 95 % interval of the share for position, given the ties"
     shown, page = (whole / "table.md").read_text(), Page((whole / "report.html").read_text()).words
     assert title in shown and title in page and meaning in shown and meaning in page
     bounds = f"[{won['low']:.2f}, {won['high']:.2f}]"

@@ -12,7 +12,7 @@ import pytest
 
 import mrctl
 from mrctl import cli
-from mrctl.experiments import bench, identify, paper, results_page, tuning
+from mrctl.experiments import bench, identify, paper, results_page, suite_tables, tuning
 from mrctl.experiments.cases import entries
 from mrctl.experiments.tables import machine, write_json
 from mrctl.results.dataset import versions
@@ -309,6 +309,13 @@ def test_refused(suite: Path, figures: Path, tmp_path: Path, capsys: pytest.Capt
         assert not out.exists()
     assert results_page.command(["--bench", str(figures), "--out", str(tmp_path / "no" / "page.md")]) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("header", [[], [suite_tables.HARMLESS], [suite_tables.CONVERGED]])
+def test_explanations(header: list[str]) -> None:
+    """The page in the repository explains its tables in the words of the code."""
+    page = (Path(results_page.__file__).parent / "RESULTS.md").read_text()
+    assert f"\n\n{suite_tables.reading(header)}\n\n" in page
 
 
 def test_machine() -> None:
