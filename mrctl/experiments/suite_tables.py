@@ -36,6 +36,14 @@ LEADING = {
 WON = "share of runs below {}: V / θ̇ / position [interval of position]"
 HARMLESS = f"share of runs at most {NO_WORSE:g}× PID: V / θ̇ / position [interval of position]"
 CONVERGED = f"laps to {RECOVERED_RATIO:g}× the final V / θ̇ / position"
+READING_OF_POSITIONS = (
+    "Lap 1, all laps and the last lap hold the mean over the runs that finished, for random worlds the median, with "
+    "its 95 % interval. Less `model` is the mean of the differences from `model`, run by run, for random worlds their "
+    "median, or a tie where the sign test does not tell the two apart. Regret is not paired: it is the mean over all "
+    "laps less that of `hindsight`, for random worlds a difference of two medians, each over the runs that finished "
+    "with that feedforward, or a tie up to the floor of differences. Excess is a mean over the runs that finished, for "
+    "random worlds too."
+)
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
 
 Row = dict[str, Any]
@@ -59,7 +67,8 @@ def tables(rows: Sequence[Row], mode: str) -> list[Table]:
             cells = last_laps(own)
             add(title, resolution(rows) if part == "floor" else against(own, "last"), cells, reading(list(cells)))
     every = [row for row in rows if row["part"] != "floor"]
-    add("Position error in mm", " ".join(against(every, window) for window in WINDOWS), positions(every))
+    says = " ".join(against(every, window) for window in WINDOWS)
+    add("Position error in mm", says, positions(every), READING_OF_POSITIONS)
     if not few and any(row["feedforward"] not in REFERENCES for row in rows):  # few draws call everyone level
         best = pd.DataFrame(leaders(every), columns=["case", *LEADING])
         add("Best in each case, and who is level with it", leading(best), best)
@@ -191,7 +200,7 @@ def reading(header: Sequence[str]) -> str:
 def positions(rows: Sequence[Row]) -> pd.DataFrame:
     """Makes the table of position errors in lap 1, all laps and the last lap, less those of `model`, and of regret.
 
-    Regret is the error over all laps less that of `hindsight`.
+    Regret is the error over all laps less that of `hindsight`; `READING_OF_POSITIONS` says how each is computed.
     """
     header = ["case", "feedforward", *WINDOWS.values(), "less `model`: lap 1 / all laps / last lap", "regret"]
     known = {row["case"]: row["position_rmse"]["all"]["value"] for row in rows if row["feedforward"] == HINDSIGHT}

@@ -316,6 +316,7 @@ def test_explanations(header: list[str]) -> None:
     """The page in the repository explains its tables in the words of the code."""
     page = (Path(results_page.__file__).parent / "RESULTS.md").read_text()
     assert f"\n\n{suite_tables.reading(header)}\n\n" in page
+    assert f"\n\n{suite_tables.READING_OF_POSITIONS}\n\n" in page
 
 
 def test_machine() -> None:
