@@ -219,13 +219,16 @@ def tables(found: Found, shown: str) -> list[Table]:
             wins = superiority(late[THIRD], late[rival], floor=TIE)
             later = centre_cell(late[THIRD][both] - late[rival][both], 2)
             word = word_of(wins, "faster", "slower")
-            parts.append(f"{word} ({plant}: before it in {wins_cell(wins)} of the pairs, on average {later} s later)")
+            parts.append(
+                f"{word} ({plant}: arrives first in {wins_cell(wins)} of the pairs; mean difference {later} s)"
+            )
     header = ["plant", "MPPI", "arrived", "collided", "later than the plan, s", "least clearance, mm"]
     header += ["arrives before the first", "before the second"]
     says = (
         f"The lag that fits PID on the nominal plant is {1e3 * lag:.0f} ms. In paired draws, with 95 % confidence, "
         f"differences up to {1e3 * TIE:.0f} ms as ties and who does not arrive as last, the third is, against the "
         f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The words follow "
-        "from the share of the pairs, and the averages are over those in which both arrive."
+        "from the share of the pairs, whose interval is given the ties. The differences, negative where the third is "
+        "earlier, are over the pairs in which both arrive."
     )
     return [Table(f"Three MPPIs ({shown})", says, frame(rows, header))]

@@ -128,6 +128,28 @@ def test_ties_of_critical_speeds() -> None:
     assert "none differs from `PID`; none differs from `model`." in suite.critical_widths(found, "car").says
 
 
+def test_words_of_three_mppis() -> None:
+    """What is said of the third is in words that tell who is earlier, and the page of results has the same words."""
+    lateness = dict(zip(three.ENTRIES, (1.0, 0.5, 0.3), strict=True))
+
+    def late(by: float) -> list[three.Run]:
+        return [three.Run("arrived", by + 0.01 * k, 0.1) for k in range(8)]
+
+    runs = {name: dict.fromkeys(three.PLANTS, late(by)) for name, by in lateness.items()}
+    (table,) = three.tables(three.Found(0.03, runs), "car")
+    words = "faster (nominal: arrives first in 1.00 [0.63, 1.00] of the pairs; mean difference -0.20"
+    assert f"against the second: {words}" in table.says
+    number = r"-?\d+(\.\d+)?"
+    form = re.sub(r"\d+ ms", "N ms", re.sub(rf"{number} \[{number}, {number}\]", "I", table.says))
+    form = re.sub(rf"mean difference {number} s", "mean difference I s", form).replace("faster", "WORD")
+    page = (Path(three.__file__).parent / "RESULTS.md").read_text()
+    says = [line for line in page.splitlines() if line.startswith("The lag that fits PID")]
+    for line in says:
+        line = re.sub(r"\d+ ms", "N ms", re.sub(rf"{number} \[{number}, {number}\]", "I", line))
+        assert re.sub("(faster|slower|level)(?= \\()", "WORD", line) == form
+    assert len(says) == 3
+
+
 def test_learned_limits() -> None:
     """What is learned on a robot that is half as heavy again and has a weak supply is what its equations say."""
     wrong = Perturbation(mass_factor=1.5, supply_factor=0.8)
