@@ -397,7 +397,7 @@ def _other_contacts(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     chassis = model.body("chassis").id
     own = [g for g in range(model.ngeom) if model.body_rootid[body[g]] == chassis and g not in wheels]
     paired = {*model.pair_geom1, *model.pair_geom2}
-    meets = ((contype[:, None] & conaffinity) | (conaffinity & contype[:, None])) & (body[:, None] != body)
+    meets = ((contype[:, None] & conaffinity) | (conaffinity[:, None] & contype)) & (body[:, None] != body)
     colliding = [g for g in own if meets[g].any() or g in paired]
     if not colliding:
         return None

@@ -225,6 +225,20 @@ def test_harmless(robot):
     assert {finding.status for finding in findings.values()} == {"passed"}
 
 
+@pytest.mark.parametrize("bits", ['contype="1" conaffinity="0"', 'contype="0" conaffinity="1"'])
+def test_one_sided_contact(robot, bits):
+    """A belly in the floor is named where MuJoCo makes contacts, whichever of the two geoms asks for them."""
+    path = robot("belly")
+    text = (path.parent / "car.xml").read_text().replace('contype="1" conaffinity="1"', bits)
+    (path.parent / "car.xml").write_text(text.replace("0 -0.0628", "0 -0.0728"))
+    model = load(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    belly = model.geom("belly").id
+    assert sum(belly in contact.geom for contact in data.contact) == 4
+    assert [suspect.cause for suspect in suspects(model)] == ["contact beside the wheels"]
+
+
 def test_unexplained(robot):
     """A fault that no inspection knows fails a check, and no cause is invented."""
     path = robot()
