@@ -11,7 +11,7 @@ import numpy as np
 from mrctl.checks.comparison import Report, compare
 from mrctl.checks.open_loop import HOLD_TIME, NO_CONTROL, Car, crisp, loss_voltage, perturbed, settling_time
 from mrctl.physics.elements import fronts
-from mrctl.theory.kinematics import scrub_free_angle, twist_from_front_wheel, wheel_rates
+from mrctl.theory.kinematics import scrub_free_angle, scrub_free_rotation, twist_from_front_wheel, wheel_rates
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
 
@@ -40,15 +40,10 @@ def rest(model: mujoco.MjModel, robot: Robot) -> Report:
     ]
 
 
-def _curvature(robot: Robot, angle: float) -> float:
-    """Returns the curvature in 1/m of the circle on which a front wheel at φ does not scrub, sin φ/(L cos φ − t)."""
-    return np.sin(angle) / (robot.wheelbase * np.cos(angle) - robot.trail)
-
-
 def _electronic_differential(robot: Robot, volts: float, angle: float, rate: float = 0.0) -> tuple[float, ...]:
     """Returns a control whose rear wheels turn as fast as the circle of a rigidly steered front wheel demands."""
     v = robot.velocity_gain * (volts - loss_voltage(robot))
-    omega = v * _curvature(robot, angle)
+    omega = scrub_free_rotation(v, angle, robot.wheelbase, robot.trail)
     differential = robot.back_emf * robot.half_track * omega / robot.wheel_radius
     return volts - differential, volts + differential, angle, rate
 
@@ -60,7 +55,7 @@ def circle(model: mujoco.MjModel, robot: Robot) -> Report:
     which turns the robot on the circle but hardly changes the radius, and the servo gives; measured 0.03 %.
     """
     angle = 0.5 * robot.steering_limit
-    radius = 1 / _curvature(robot, angle)
+    radius = 1 / scrub_free_rotation(1.0, angle, robot.wheelbase, robot.trail)
     v = np.sqrt(0.1 * robot.tyre_friction * GRAVITY * radius)
     volts = v / robot.velocity_gain + loss_voltage(robot)
     report = []
@@ -162,7 +157,7 @@ def cornering(model: mujoco.MjModel, robot: Robot) -> Report:
     angle = 0.3
     limit = 0.2 * robot.tyre_friction * GRAVITY
     slippery = perturbed(model, Perturbation(tyre_friction_factor=0.2))
-    radius = 1 / _curvature(robot, angle)
+    radius = 1 / scrub_free_rotation(1.0, angle, robot.wheelbase, robot.trail)
     logs = []
     for ratio in (0.5, 2.0):
         v = np.sqrt(ratio * limit * radius)

@@ -6,6 +6,7 @@ import numpy as np
 
 from mrctl.control.features import SIGN_SPEED
 from mrctl.kernel import Array, Row, kernel
+from mrctl.theory.kinematics import scrub_free_rotation
 
 HOLD_SPEED = 0.02  # m/s; below it the fork holds its angle
 
@@ -115,7 +116,7 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
         s.angle = robot.steering_limit if s.angle > 0 else -robot.steering_limit
         s.rate = 0.0
         if robot.rigid:
-            s.excess[1] = v * np.tan(s.angle) / robot.wheelbase - omega
+            s.excess[1] = scrub_free_rotation(v, s.angle, robot.wheelbase, robot.trail) - omega
             s.saturated = True
     middle = s.angle + s.rate * period / 2  # the middle of the period for which the set-point is held
     s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate

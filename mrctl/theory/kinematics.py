@@ -1,6 +1,6 @@
 """Equations (1) and (2) of the paper: how the robot moves while its wheels roll without slipping.
 
-Every function works on arrays with any leading batch dimensions; the last axis holds the components.
+Every function but the kernel works on arrays with any leading batch dimensions; the last axis holds the components.
 A twist is (V_AV, θ̇) of P, the midpoint of the rear axle, in (m/s, rad/s). Angles are counter-clockwise.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrctl.kernel import Array
+from mrctl.kernel import Array, kernel
 from mrctl.theory.robot import Robot
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -144,3 +144,18 @@ def scrub_free_angle(twist: ArrayLike, robot: Robot) -> Array:
     speed = np.hypot(v, robot.wheelbase * omega)
     swing = np.arcsin(robot.trail * omega / np.where(speed > 0, speed, 1.0))
     return steering_angle(twist, robot) - np.where(v < 0, -swing, swing)
+
+
+@kernel
+def scrub_free_rotation(v: float, angle: float, wheelbase: float, trail: float) -> float:
+    """The θ̇ in rad/s at which a front wheel held at φ is not dragged sideways: V sin φ/(L cos φ − t).
+
+    It is the inverse of `scrub_free_angle`; at V = 1 m/s it is the curvature of the circle that P drives, in 1/m.
+
+    Args:
+        v: V in m/s.
+        angle: Steering angle φ in rad.
+        wheelbase: L in m.
+        trail: Trail t in m.
+    """
+    return v * np.tan(angle) / (wheelbase - trail / np.cos(angle))

@@ -122,6 +122,16 @@ def test_scrub_free_no_trail(robot):
     np.testing.assert_allclose(printed / radius - 1, [0.10, 0.08], atol=0.005)
 
 
+@given(st.floats(0.1, 2), st.sampled_from([-1, 1]), st.floats(-1, 1), st.floats(0, 0.05))
+def test_scrub_free_rotation(robot, speed, sense, angle, trail):
+    """At the θ̇ of a held wheel the contact behind the steering axis moves along the wheel only."""
+    twist = sense * speed, k.scrub_free_rotation(sense * speed, angle, robot.wheelbase, trail)
+    velocity = contact_velocity(twist, robot.wheelbase - trail * np.exp(1j * angle)) / np.exp(1j * angle)
+    assert velocity.imag == pytest.approx(0, abs=1e-12)
+    trailing = robot.model_copy(update={"trail": trail})
+    assert k.scrub_free_angle(twist, trailing) == pytest.approx(angle, abs=1e-9)
+
+
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
 def test_angles_finite(robot, v, omega):
     """The angles are never NaN, and a turn the other way mirrors them."""

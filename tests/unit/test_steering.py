@@ -186,6 +186,19 @@ def test_rigid_correction(stiff):
         assert allocation.saturated == 1
 
 
+@given(st.floats(0.1, 1.5), st.sampled_from([-1, 1]), st.floats(0.001, 0.05))
+def test_stop_with_trail(robot, v, side, trail):
+    """At its stop a trailing wheel makes the θ̇ of the circle on which its contact is not dragged sideways."""
+    trailing = robot.model_copy(update={"trail": trail})
+    allocation = Allocation(trailing, rigid=True, angle=side * robot.steering_limit)
+    allocation([v, 20.0 * side])
+    assert allocation.angle == side * robot.steering_limit
+    made = 20.0 * side + allocation.excess[1]
+    contact = robot.wheelbase - trail * np.exp(1j * allocation.angle)
+    velocity = (v + 1j * made * contact) * np.exp(-1j * allocation.angle)
+    assert velocity.imag == pytest.approx(0, abs=1e-12)
+
+
 @pytest.mark.parametrize("rigid", [False, True])
 @pytest.mark.filterwarnings("ignore:invalid value")
 @given(
