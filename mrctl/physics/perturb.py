@@ -68,27 +68,28 @@ def perturb(
     p = perturbation
     scratch = scratch or mujoco.MjData(nominal)
     robot = robot or read_robot(nominal, scratch=scratch)
+    before = load_torques(nominal, scratch)
+    shares = _loss_shares(nominal, robot, before)
     _perturb_bodies(nominal, model, p, robot.wheel_radius)
     _perturb_wheels(nominal, model, p)
-    _perturb_motors(nominal, model, p)
+    _perturb_motors(nominal, model, p, shares)
     model.pair_friction[:] = nominal.pair_friction
     model.pair_friction[:, :2] *= p.tyre_friction_factor
     model.pair_friction[left_tyre_pairs(nominal), :2] *= p.left_tyre_friction_factor
     gx, gy, gz = nominal.opt.gravity
     c, s = np.cos(p.slope), np.sin(p.slope)
     model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx
-    before, after = load_torques(nominal, scratch), load_torques(model, scratch)
+    after = load_torques(model, scratch)
     if min(after.values()) <= 0:
         raise InputError("perturbation.payload: the centre of mass lies outside the wheels; the robot would tip over")
     height = at_rest(model, scratch)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
     if height < 0:
         raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
-    factors = dict(zip(REAR, _drive_frictions(p), strict=True))
+    more: dict[str, float] = dict(zip(REAR, robot.drive_loss * shares * (_drive_frictions(p) - 1), strict=True))
     for wheel in (*REAR, *rolling_fronts(nominal)):
         dof = nominal.joint(wheel).dofadr[0] + np.arange(len(nominal.joint(wheel).frictionloss))
-        drive = robot.drive_loss * (factors[wheel] - 1) if wheel in factors else 0.0
         rolling = robot.rolling_coefficient * (after[wheel] - before[wheel])
-        model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
+        model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + more.get(wheel, 0.0) + rolling
     mujoco.mj_setConst(model, scratch)
 
 
@@ -116,8 +117,15 @@ def _perturb_wheels(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbat
         model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
 
 
-def _perturb_motors(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbation) -> None:
-    """Writes resistances, motor constants and supply of the motors, and their no-load current."""
+def _perturb_motors(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbation, shares: Array) -> None:
+    """Writes resistances, motor constants and supply of the motors, and their no-load current.
+
+    Args:
+        nominal: The nominal model.
+        model: The model that is written.
+        p: The perturbation.
+        shares: Those of `_loss_shares`, `(2,)`.
+    """
     motors = [nominal.actuator(name).id for name in MOTORS]
     resistance = p.resistance_factor * np.array([p.left_resistance_factor, p.right_resistance_factor])
     constant = p.motor_constant_factor * np.array([p.left_motor_constant_factor, p.right_motor_constant_factor])
@@ -131,8 +139,22 @@ def _perturb_motors(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbat
     model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
     # The no-load torque k_M I_0 is a loss: it grows with the drive friction, and not with the motor constant. The model
     # holds one current, with which the mean constant of the two motors gives their mean loss.
-    no_load = nominal.numeric("no_load_current").data * _drive_frictions(p).mean() / constant.mean()
+    no_load = nominal.numeric("no_load_current").data * (shares * _drive_frictions(p)).mean() / constant.mean()
     model.numeric("no_load_current").data[:] = no_load
+
+
+def _loss_shares(nominal: mujoco.MjModel, robot: Robot, loads: dict[str, float]) -> Array:
+    """Returns the losses of the left and the right drive over their mean, which is `drive_loss`, `(2,)`.
+
+    Args:
+        nominal: The nominal model.
+        robot: Its parameters.
+        loads: Its `load_torques`, to which the rolling loss of a wheel is proportional.
+    """
+    if robot.drive_loss == 0:
+        return np.ones(2)
+    left, right = (nominal.joint(w).frictionloss[0] - robot.rolling_coefficient * loads[w] for w in REAR)
+    return 1 + (left - right) / (2 * robot.drive_loss) * np.array([1.0, -1.0])
 
 
 def _drive_frictions(p: Perturbation) -> Array:

@@ -144,6 +144,22 @@ def test_drive_friction():
         assert robot.rolling_force == pytest.approx(BASE.rolling_force)
 
 
+def test_drive_friction_of_unequal_wheels():
+    """Each drive's own loss is scaled: what is left at factor 0 is the rolling loss of the load on the wheel."""
+    own = mjcf.clone(NOMINAL)
+    rolling = BASE.rolling_coefficient * BASE.wheel_radius * (1 - BASE.front_load) / 2 * BASE.mass * GRAVITY
+    wheels, losses = ("wheel_left", "wheel_right"), rolling + np.array([0.037, 0.137])
+    for wheel, loss in zip(wheels, losses, strict=True):
+        own.joint(wheel).frictionloss[0] = loss
+    own.numeric("no_load_current").data[:] = 0.08 / BASE.back_emf
+    for left, right in ((0.0, 0.0), (1.0, 1.0), (3.0, 0.5), (20.0, 0.0), (0.0, 20.0)):
+        model = mjcf.clone(own)
+        perturb(own, model, Perturbation(left_drive_friction_factor=left, right_drive_friction_factor=right))
+        expected = rolling + np.array([0.037 * left, 0.137 * right])
+        assert [model.joint(wheel).frictionloss[0] for wheel in wheels] == pytest.approx(expected)
+        assert read_robot(model).drive_loss == pytest.approx(expected.mean() - rolling, abs=1e-12)
+
+
 def test_rolling_follows_load():
     """A payload adds its rolling loss to the frictionloss of each wheel."""
     model = perturbed(mass_factor=1.5)
