@@ -48,10 +48,12 @@ class Margins(NamedTuple):
     """Bandwidth and margins of one loop.
 
     Attributes:
-        crossover: Gain crossover in rad/s; NaN, as phase and delay, where the loop gain does not fall through one.
-        phase: Phase margin in degrees.
-        gain: Gain margin as a factor; infinite if the phase never reaches −180°.
-        delay: Delay margin in s.
+        crossover: Frequency in rad/s at which the loop gain passes through one; of several, that of the phase margin.
+            It is NaN, as phase and delay, where there is none.
+        phase: Phase margin in degrees, the smallest of all such frequencies; negative if the loop is unstable.
+        gain: Gain margin as a factor, the smallest of all frequencies at which the phase falls through an odd multiple
+            of −180°; below one if the loop is unstable, and infinite if the phase never reaches −180°.
+        delay: Delay margin in s, the smallest of all crossovers.
         bandwidth: Frequency in rad/s at which the gain of the closed loop falls through 1/√2; NaN where it does not.
         sensitivity: M_s = max |S| with S = 1/(1 + L), the reciprocal of the least distance of L from −1.
     """
@@ -73,22 +75,32 @@ def margins(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
     """
     magnitude, phase = np.abs(loop), np.unwrap(np.angle(loop))
     phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))  # PI control starts between 0 and −180°
-    crossover, phase_margin, bandwidth = np.nan, np.nan, np.nan
-    if magnitude[0] > 1 > magnitude[-1]:
-        crossing = int(np.argmax(magnitude < 1))
-        crossover, phase_margin = frequency[crossing], np.pi + phase[crossing]
+    crossover, phase_margin, delay, bandwidth = np.nan, np.nan, np.nan, np.nan
+    above = magnitude > 1
+    if (k := np.flatnonzero(above[:-1] != above[1:])).size:
+        share = (1 - magnitude[k]) / (magnitude[k + 1] - magnitude[k])
+        crossovers, left = _between(frequency, k, share), np.pi + _between(phase, k, share)
+        crossover, phase_margin, delay = crossovers[left.argmin()], left.min(), (left / crossovers).min()
+    turns = (phase + np.pi) / (2 * np.pi)  # whole where L is negative
+    k = np.flatnonzero(np.floor(turns[1:]) < np.floor(turns[:-1]))
+    share = (np.floor(turns[k]) - turns[k]) / (turns[k + 1] - turns[k])
+    inverted = _between(magnitude, k, share)
     passed = np.abs(loop / (1 + loop)) < np.sqrt(0.5)
     if passed.any() and not passed[0]:
         bandwidth = frequency[int(np.argmax(passed))]
-    inverted = np.flatnonzero((phase < -np.pi) & (magnitude < 1))
     return Margins(
         crossover=float(crossover),
         phase=float(np.degrees(phase_margin)),
-        gain=float(1 / magnitude[inverted[0]]) if inverted.size else float("inf"),
-        delay=float(phase_margin / crossover),
+        gain=float((1 / inverted).min(initial=np.inf)),
+        delay=float(delay),
         bandwidth=float(bandwidth),
         sensitivity=float(np.abs(1 / (1 + loop)).max()),
     )
+
+
+def _between(values: Array, k: NDArray[np.intp], share: Array) -> Array:
+    """Interpolates linearly: what lies at these shares of the ways from values k to values k + 1."""
+    return values[k] + share * (values[k + 1] - values[k])
 
 
 def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:

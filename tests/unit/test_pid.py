@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import signal
 from scipy.optimize import brentq, minimize_scalar
 
+from mrctl.control import design
 from mrctl.control.margins import Gains, learning_ratio, margins, sampled_loop
 from mrctl.control.pid import PID, Pid, imc, pid
 from mrctl.kernel import over_rows
@@ -169,6 +170,35 @@ def test_margins_of_other_gains():
     assert found.gain == pytest.approx(1 / size(inversion), rel=1e-3)
     # Delayed by its delay margin the loop is on the brink.
     assert margins(GRID, loop * np.exp(-1j * GRID * found.delay)).phase == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize("k_p", [40.0, 200.0, 1000.0])
+def test_margins_of_unstable_loops(robot, k_p):
+    """Multiplied by its gain margin, which is below one if the loop is unstable, the loop runs through −1."""
+    plant, h, gains = design.plants(robot, False, 0)[0], 0.01, Gains(k_p, 300.0)
+    frequency = np.geomspace(1, 0.999 * np.pi / h, 4000)
+    found = margins(frequency, sampled_loop(frequency, plant, gains, h, 0.02))
+    dense = np.linspace(40, 100, 400_001)
+    loop = sampled_loop(dense, plant, gains, h, 0.02)
+    through = np.argmin(np.abs(loop.imag))
+    assert found.gain == pytest.approx(-1 / loop.real[through], rel=1e-4)
+    assert np.abs(1 + found.gain * loop).min() < 1e-4
+    assert (found.gain < 1) == (k_p > 100)
+    assert not (found.phase > 0) == (k_p > 100)  # NaN where the gain never falls to one
+
+
+def test_smallest_margins():
+    """A resonance beyond the first crossover makes three of them; the smallest margins count, wherever they are."""
+    w, resonance = GRID, 40.0
+    loop = 10 / (1j * w) * resonance**2 / (resonance**2 - w**2 + 0.04j * resonance * w)
+    found = margins(w, loop)
+    magnitude, phase = np.abs(loop), np.angle(loop) % (-2 * np.pi)
+    crossed = np.flatnonzero(np.diff(np.sign(magnitude - 1)))
+    assert len(crossed) == 3
+    assert found.phase == pytest.approx(180 + np.degrees(phase[crossed].min()), abs=0.05)
+    assert found.crossover == pytest.approx(w[crossed[-1]], rel=1e-4)
+    assert found.delay == pytest.approx(((np.pi + phase[crossed]) / w[crossed]).min(), rel=1e-3)
+    assert found.gain == pytest.approx(0.04 * resonance / 10, rel=1e-3)  # at the resonance L is −10/(0.04 · 40)
 
 
 def test_no_margins():
