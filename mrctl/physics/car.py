@@ -68,10 +68,13 @@ class CarPhysics(dm_mujoco.Physics):
     def motor_current(self) -> Array:
         """Returns the armature currents left and right in A, `(2,)`.
 
-        They are (U − k_E N ω)/R_a, or the current states of motors with inductance, within the limit of the drivers.
+        They are (U − k_E N ω)/R_a with the voltages U within the supply, or the current states of motors with
+        inductance, within the limit of the drivers.
         """
         model, data = self.model.ptr, self.data
         resistance, back_emf, states = motor_parameters(model)
-        free = (data.ctrl[inputs(model)[:2]] - back_emf * self.wheel_rates()) / resistance
+        motors = inputs(model)[:2]
+        voltage = np.clip(data.ctrl[motors], *model.actuator_ctrlrange[motors].T)
+        free = (voltage - back_emf * self.wheel_rates()) / resistance
         limit = current_limits(model)
         return np.clip(data.act[states] if states else free, -limit, limit)

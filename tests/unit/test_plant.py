@@ -87,6 +87,17 @@ def test_limited_current():
     assert physics.motor_current()[0] == pytest.approx(2.0)
 
 
+def test_current_beyond_the_supply():
+    """More voltage than the supply has is clipped in the current that is read, as in the engine's torque."""
+    physics = CarPhysics.from_world()
+    physics.set_control([40.0, -40.0, 0, 0])
+    physics.step()
+    physics.forward()
+    sensor = physics.named.data.sensordata
+    torque = [sensor["motor_torque_left"].item(), sensor["motor_torque_right"].item()]
+    assert ROBOT.torque_constant * physics.motor_current() == pytest.approx(torque, abs=1e-9)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e11])
 def test_blown_up(value):
     """A value that is not finite, or huge, anywhere in the state makes the cosine of the tilt NaN."""
