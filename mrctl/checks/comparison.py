@@ -59,4 +59,5 @@ def compare(
 
 def between(quantity: str, measured: float, low: float, high: float, unit: str = "") -> Comparison:
     """Compares a measured value with an interval, bounds included."""
-    return compare(quantity, measured, (low + high) / 2, unit, absolute=(high - low) / 2)
+    middle = (low + high) / 2
+    return compare(quantity, measured, middle, unit, absolute=max(middle - low, high - middle))

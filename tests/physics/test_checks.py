@@ -5,6 +5,8 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mrctl.checks.catalogue import CHECKS, Check
 from mrctl.checks.comparison import CheckFailed, Comparison, between, compare
@@ -116,3 +118,13 @@ def test_compare_accepts():
     comparison = compare("speed", 1.5, 1.0, "m/s", absolute=0.5)
     assert comparison == Comparison("speed", 1.5, 1.0, 0.5, "m/s") and comparison.passed
     assert between("speed", 2.0, 0.0, 2.0).passed and not between("speed", 2.1, 0.0, 2.0).passed
+
+
+@given(st.floats(-1e9, 1e9), st.floats(-1e9, 1e9))
+def test_between(one, other):
+    """Both ends of any interval pass, and what lies outside by a millionth of its width and of its ends does not."""
+    low, high = sorted((one, other))
+    assert between("speed", low, low, high).passed and between("speed", high, low, high).passed
+    beyond = 1e-6 * (high - low + abs(low) + abs(high)) + 1e-300
+    assert not between("speed", low - beyond, low, high).passed
+    assert not between("speed", high + beyond, low, high).passed
