@@ -62,8 +62,9 @@ class Mistake(NamedTuple):
 def reach(robot: Robot) -> Array:
     """Returns the largest V, θ̇, V̇ and θ̈ that the motors reach by equation (3), `(4,)`, in SI units."""
     loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
-    stall = robot.motor_gain * robot.supply - loss
-    speed = robot.velocity_gain * stall / robot.motor_gain
+    per_volt = robot.drive_gain * robot.motor_gain  # torque per commanded volt, N·m/V
+    stall = per_volt * robot.supply - loss
+    speed = robot.velocity_gain * stall / per_volt
     force = 2 * stall / robot.wheel_radius
     turning = force * robot.half_track / robot.effective_inertia
     return np.array([speed, speed / robot.half_track, force / robot.effective_mass, turning])

@@ -157,12 +157,12 @@ class Robot(Record):
 
     @property
     def velocity_gain(self) -> float:
-        """Static gain of the common channel, V per U_Σ, in m/s/V."""
-        return self.wheel_radius / self.back_emf
+        """Static gain of the common channel, V per commanded U_Σ, in m/s/V."""
+        return self.drive_gain * self.wheel_radius / self.back_emf
 
     @property
     def rotation_gain(self) -> float:
-        """Static gain of the differential channel, θ̇ per U_Δ, in rad/s/V."""
+        """Static gain of the differential channel, θ̇ per commanded U_Δ, in rad/s/V."""
         return self.velocity_gain / self.half_track
 
     @property

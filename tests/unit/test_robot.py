@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mrctl.checks.open_loop import Car
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError, Record
 from mrctl.theory.drive import NO_LIMIT
+from mrctl.theory.dynamics import accelerations, left_right
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
 
@@ -32,6 +34,28 @@ numbers = st.floats() | st.floats(-2, 2) | st.integers() | st.sampled_from([None
 def test_published(robot, name, value, tolerance):
     """The derived parameters are those stated for the default robot."""
     assert getattr(robot, name) == pytest.approx(value, abs=tolerance)
+
+
+@pytest.mark.parametrize("drive_gain", [1.0, 0.8])
+def test_gains_settle(robot, drive_gain):
+    """A robot without losses and lever settles, by equation (3), at the static gains times the commanded voltages."""
+    free = {"no_load_current": 0.0, "gear_loss": 0.0, "rolling_coefficient": 0.0, "com_offset": 0.0}
+    robot = robot.model_copy(update={"drive_gain": drive_gain, **free})
+    twist, step = np.zeros(2), 0.01
+    for _ in range(1000):
+        twist = twist + step * accelerations(twist, left_right([6.0, 2.0]), robot)
+    assert twist == pytest.approx([6.0 * robot.velocity_gain, 2.0 * robot.rotation_gain])
+
+
+def test_gain_of_a_weak_supply():
+    """In MuJoCo 0.8 V more for each volt commanded change the settled speed by the gain of the robot on that supply."""
+    model = mjcf.load()
+    speeds = []
+    for volts in (6.0, 12.0):
+        car = Car(model)
+        car.drive(3.0, (0.8 * volts, 0.8 * volts, 0.0, 0.0))
+        speeds.append(car.drive(0.1, (0.8 * volts, 0.8 * volts, 0.0, 0.0))["v"][-1])
+    assert np.diff(speeds)[0] / 6.0 == pytest.approx(read_robot(model, 0.8).velocity_gain, rel=5e-3)
 
 
 def test_motor_limits(robot):
