@@ -94,7 +94,8 @@ class Sensing(Record):
     by default the truth in the ideal tier and the filter in the others."""
     localisation: Localisation = "fixes"
     """Source of posture fixes: the `fixes` below, or a lidar and the map of the scenario, by matching
-    each `scan` with the map or by a filter of `particles`."""
+    each `scan` with the map or by a filter of `particles`. Fixes are always recorded, but of the estimators only `ekf`,
+    or one of your own, uses them."""
     lidar: Lidar = Lidar()
     """Lidar, for localisation by `scan` or `particles`, for motion controllers that avoid obstacles, and for agents."""
     encoder_counts: Annotated[int, Field(ge=0, le=10**9)] | None = None
@@ -229,14 +230,16 @@ class Sensing(Record):
 
         Raises:
             ValueError: A time is no whole number of control periods, more than four fixes are on their way at the same
-                time, fixes are older than the run, `fix_rate` is set though fixes come from a lidar, these come before
-                the odometry that they need, or the start is unknown and nothing looks for it.
+                time, fixes are older than the run, `fix_rate` or `fix_outliers` is set though fixes come from a lidar,
+                these come before the odometry that they need, or the start is unknown and nothing looks for it.
         """
         if self.start_unknown and (self.localisation == "fixes" or self.source != "ekf"):
             raise ValueError("sensing.start_unknown: needs localisation by scan or particles, and the estimator ekf")
         if self.localisation != "fixes":
             if self.fix_rate is not None:
                 raise ValueError("sensing.fix_rate: with a lidar the rate of fixes is that of its scans, lidar.rate")
+            if self.fix_outliers:
+                raise ValueError("sensing.fix_outliers: has no effect with a lidar, which makes its own fixes")
             self.lidar.every(control_period)
         for name in TIER_VALUES:
             if name.endswith(("_rate", "_latency")) or name == "delay":

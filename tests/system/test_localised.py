@@ -100,6 +100,7 @@ def test_user_receives_the_same_fixes():
         ({"obstacles": Obstacles()}, "sensing.localisation: the map has no obstacles"),
         ({"sensing": {"localisation": "scan", "lidar": {"rate": 30}}}, "sensing.lidar.rate: 30 Hz is no whole"),
         ({"sensing": {"localisation": "scan", "fix_rate": 10}}, "sensing.fix_rate: with a lidar"),
+        ({"sensing": {"localisation": "scan", "fix_outliers": 0.1}}, "sensing.fix_outliers: has no effect"),
         (
             {"sensing": {"localisation": "particles", "encoder_latency": 0.1, "fix_latency": 0.0}},
             "sensing.fix_latency: with a lidar it must be at least encoder_latency, 0.1 s",
