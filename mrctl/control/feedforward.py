@@ -43,6 +43,7 @@ class Feedforward(Protocol):
     - `restore(rows)` resets the robots with these indices to their initial weights, for the guard
       (`mrctl.control.guard`).
     - `guarded` is False where the guard shall not watch it.
+    - `rigid` says whether it takes the second channel for steering; where the steering is otherwise it is refused.
     - `adapted()` returns what each robot has learned, a dict of arrays `(B, …)` by name, whose shapes stay the same;
       `mrctl.save_learned` writes those of one robot to a file.
     - `adopt(row, learned)` lets one robot start from such a file, a dict of the same arrays without the axis B. It is

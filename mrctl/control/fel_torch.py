@@ -40,9 +40,11 @@ class ModuleLearning:
     """Feedback-error learning of B copies of a torch module, with the update and safeguards of `fel`.
 
     The output is scale · (f_W(x) − f_W₀(x)), so that learning begins as pure PID with any module. `simulate` takes it
-    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`, and tells it the delay of the loop.
+    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`, and tells it the delay of the loop. Under
+    `rigid` steering it needs `rigid=True`, as a factory does not know the steering; without it the run is refused.
 
     Attributes:
+        rigid: Whether the second channel is steering.
         state: Parameters W by name, each with a leading axis B.
         weight_norm: ‖W − W₀‖, `(B,)`.
     """
@@ -72,6 +74,7 @@ class ModuleLearning:
             raise ValueError(f"module: does not map 8 features to 2 channels: {error}") from None
         if shape != (CHANNELS,):
             raise ValueError(f"module: maps 8 features to shape {shape}, not to 2 channels")
+        self.rigid = rigid
         self._half_track = robot.half_track
         self._scale = feature_scale(robot)
         start = fresh([settings], rigid)[0]

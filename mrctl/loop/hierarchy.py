@@ -241,7 +241,8 @@ class Hierarchy:
             stages: The user's stages, by name.
 
         Raises:
-            InputError: What was learned or the weights cannot be read, or do not suit the learner.
+            InputError: What was learned or the weights cannot be read, or do not suit the learner, or the user's
+                feedforward was made for another steering.
         """
         first, size = scenarios[0], len(scenarios)
         self.robot, self.rigid, self.stages = robot, first.steering == "rigid", stages or {}
@@ -253,7 +254,7 @@ class Hierarchy:
         self._knows_truth = first.prior == "true_model"
         delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
         if own := self.stages.get("feedforward"):
-            self.learner = UserFeedforward(own, self.prior, self.period, delays[0])
+            self.learner = UserFeedforward(own, self.prior, self.rigid, self.period, delays[0])
             load = self.learner.load
         else:
             self.learner, load = learner_of(scenarios, robot), load_learned

@@ -140,19 +140,22 @@ class UserFeedforward:
         shapes: Names of what a user's object of another kind keeps, and their shapes for one robot.
     """
 
-    def __init__(self, stage: UserStage, prior: Prior, period: float, delay: float) -> None:
+    def __init__(self, stage: UserStage, prior: Prior, rigid: bool, period: float, delay: float) -> None:
         """Tells the user's object its loop.
 
         Args:
             stage: The stage.
             prior: The prior that is added to its output.
+            rigid: Whether the second channel is steering.
             period: Control period in s.
             delay: Delay of the loop that the controllers know, in s.
 
         Raises:
-            StageError: The stage raised, or says what it keeps in another form.
+            StageError: The stage raised, says what it keeps in another form, or was made for another second channel.
         """
         self.stage, own = stage, stage.stage
+        if (made_for := getattr(own, "rigid", rigid)) != rigid:
+            raise StageError(f"{stage.title}: it was made with rigid={made_for}, the steering asks for rigid={rigid}")
         self.guarded, self.restorable = bool(getattr(own, "guarded", True)), bool(getattr(own, "restore", None))
         self.learner = own if isinstance(own, Learner) else None
         if self.learner:

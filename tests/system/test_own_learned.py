@@ -97,6 +97,19 @@ def test_it_helps(learned, tmp_path):
     assert within < 0.7 * without
 
 
+@pytest.mark.parametrize("steering", ["compliant", "rigid"])
+def test_module_made_for_other_steering(steering):
+    """A torch module whose second channel is not that of the steering is refused in one line, and drives if it is."""
+
+    def module(rigid):
+        return lambda robot, size: ModuleLearning(torch.nn.Linear(8, 2), robot, size, rigid=rigid)
+
+    rigid, short = steering == "rigid", BASE.replace(steering=steering, laps=1)
+    Simulation([short], feedforward=module(rigid))
+    with pytest.raises(mrctl.InputError, match=rf"^feedforward .*: it was made with rigid={not rigid}, .*={rigid}$"):
+        Simulation([short], feedforward=module(not rigid))
+
+
 def test_module(tmp_path):
     """A torch module that starts elsewhere adopts what another one has learned: its outputs are those to the bit."""
 
