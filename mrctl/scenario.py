@@ -74,7 +74,8 @@ class Event(Record):
     without `tune`."""
     pid: Pid | None = None
     """Settings of the velocity PID from then on; the gains of the motion controller stay, and so does the delay that
-    oscillations have added. Refused where a user's stage takes the place of the PID."""
+    oscillations have added. With `retune` off or a `time_constant` the PID is designed without that delay, and the
+    motion controller stays as slow as it is. Refused where a user's stage takes the place of the PID."""
     learning: bool | None = None
     """Whether the feedforward learns from then on."""
 
@@ -126,7 +127,7 @@ class Scenario(Record):
     kanayama: Kanayama = Kanayama()
     """Gains of the motion controller, by default designed for the velocity loops."""
     pid: Pid = Pid()
-    """Settings of the velocity PID, by default designed for the delay of `sensing`."""
+    """Settings of the velocity PID, by default designed for the delay of the loop."""
     fel: Fel = Fel()
     """Settings of the learner `fel`."""
     rls: Rls = Rls()

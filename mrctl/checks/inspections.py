@@ -22,7 +22,7 @@ from mrctl.kernel import Array
 from mrctl.physics.elements import MOTORS, REAR, fronts, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import reaches_limits, sufficient_gears
+from mrctl.physics.units import RPM_PER_RAD_S, reaches_limits, sufficient_gears
 from mrctl.theory.robot import GRAVITY, Robot
 
 Part = Any  # the name of an element of a model, or its index
@@ -244,14 +244,14 @@ def _armature(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 def _no_load_rpm(robot: Robot) -> float:
     """Returns the no-load speed of a motor at its own shaft in rpm."""
-    return robot.supply / robot.torque_constant * 30 / np.pi
+    return robot.supply / robot.torque_constant * RPM_PER_RAD_S
 
 
 def _constant(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     rpm = _no_load_rpm(robot)
     if 100 <= rpm <= 60e3:
         return None
-    factor = next((f for f in (30 / np.pi, np.sqrt(30 / np.pi), 1e-3) if 1e3 <= rpm / f <= 3e4), 1.0)
+    factor = next((f for f in (RPM_PER_RAD_S, np.sqrt(RPM_PER_RAD_S), 1e-3) if 1e3 <= rpm / f <= 3e4), 1.0)
     unit = "mN·m/A" if factor == 1e-3 else "V/rpm"
     speed = f"{robot.supply:g} V is a no-load speed of {rpm:,.0f} rpm at its own shaft"
 

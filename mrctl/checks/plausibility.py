@@ -16,7 +16,7 @@ from mrctl.checks.comparison import Report, between, compare
 from mrctl.checks.open_loop import HOLD_TIME, NO_CONTROL, Car, Log, caster_gaps, on_skid, rolling_wheels
 from mrctl.physics.elements import MOTORS, REAR, part
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import GYRATION_RATIOS, bounds, extent
+from mrctl.physics.units import GYRATION_RATIOS, RPM_PER_RAD_S, bounds, extent
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import Robot
 
@@ -107,7 +107,7 @@ def motors(model: mujoco.MjModel, robot: Robot) -> Report:
         inertia = model.actuator_armature[actuator.id] + model.joint(wheel).armature[0] / gear**2
         volts = model.actuator_ctrlrange[model.actuator_ctrladr[actuator.id], 1]
         report += [
-            between(f"no-load speed of {motor}", volts / constant * 30 / np.pi, 100, 60e3, "rpm"),
+            between(f"no-load speed of {motor}", volts / constant * RPM_PER_RAD_S, 100, 60e3, "rpm"),
             between(f"time constant of {motor}", inertia * resistance / constant**2, 0.5e-3 * (gear > 3), 0.2, "s"),
         ]
     return report

@@ -2,10 +2,11 @@
 
 This is the simplex architecture (Seto, Krogh, Sha and Chutinan 1998): a controller that may be wrong has full authority
 as long as the state is one from which a trusted one, here PID and nominal model, recovers. Let d be the deviation of a
-channel, d = authority · (learner − model), e the error of its velocity, and ρ the posture error. The region of recovery
-is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if the peak of its |d|, which decays with a time constant
-of 1 s, exceeds D or, for a posture error, D_ρ, and for an oscillation if it exceeds a quarter of D. What learning has
-taken from the PID's integral counts like a d; its sum decays with the same time constant.
+channel, d = authority · (learner − model), e the error of its velocity, ρ the posture error, and ρ_min the least ρ so
+far. The region of recovery is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if the peak of its |d|,
+which decays with a time constant of 1 s, exceeds D or, for a posture error, D_ρ, and for an oscillation if it exceeds a
+quarter of D. What learning has taken from the PID's integral counts like a d; its sum decays with the same time
+constant.
 
     D = ē/‖G_e‖₁,    D_ρ = min(D, ρ̄/(√2 ‖G_ρ‖₁))
 
@@ -14,7 +15,7 @@ of what the two channels contribute. With the PIDs of the tiers D_ρ = D.
 
 | cause of a fallback   | condition                                                                         |
 | --------------------- | --------------------------------------------------------------------------------- |
-| error                 | |e| > ē, or ρ > ρ̄ and 3 times the least ρ so far, while the learner is to blame   |
+| error                 | |e| > ē, or ρ > max(ρ̄, 3 ρ_min), while the learner is to blame                   |
 | sustained oscillation | 16 half-waves of the PID's output in a row beyond D/4 while it is to blame        |
 | not finite            | NaN or ∞ from the learner                                                         |
 
@@ -205,7 +206,8 @@ class Guard(Record):
     0.27 m/s and 0.75 rad/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Share of D, by more than which the PID's output must swing, and the learner deviate from the fallback, for an
-    oscillation to count; a deviation of D in V (rad/s on a steering channel) cannot take the errors out of bounds."""
+    oscillation to count. D, in V (rad/s on a steering channel), is the largest deviation of the learner that cannot
+    take the error of the velocity out of its bound, however it changes."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
     """Factor by which the posture error may exceed the smallest one so far; 0.15 m are tolerated in any case."""
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0
@@ -214,8 +216,8 @@ class Guard(Record):
     """Number of times that the learner may resume, from the second on with a third of the gain each time; then the
     fallback stays."""
     fade: Annotated[float, Field(gt=0, le=2)] = 0.1
-    """Time constant in s with which the step in voltage at the beginning of a fallback fades; the step is limited to D,
-    the deviation that `oscillation` explains."""
+    """Time constant in s with which the step in voltage at the beginning of a fallback fades. The step is limited to
+    the largest deviation from the fallback that cannot take the error of the velocity out of its bound."""
     fallback: Literal["model", "none"] = "model"
     """Feedforward during a fallback: the nominal inverse dynamics (`model`), or PID alone (`none`)."""
 

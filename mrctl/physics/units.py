@@ -23,7 +23,8 @@ from mrctl.physics.elements import REAR, bodies_of, fronts, part, rolling_fronts
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, LIMITS, Robot
 
-RPM = 30 / math.pi  # rpm of 1 rad/s
+RPM_PER_RAD_S = 30 / math.pi
+"""Rate of one radian per second in rpm."""
 GYRATION_RATIOS = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
 MAX_LENGTH_RATIO = 20.0  # largest length of a part over the track of a robot
 LENGTH_ATTRIBUTES = (
@@ -97,7 +98,7 @@ def bounds(robot: Robot) -> list[Bound]:
         Bound("wheel radius over the size", robot.wheel_radius / size, 0.005, 1, ""),
         Bound("friction of the tyres", robot.tyre_friction, 0.01, 3, ""),
         Bound("rolling resistance over the load", robot.rolling_coefficient, 0, 0.5, ""),
-        Bound("no-load speed of the motors", robot.supply / robot.torque_constant * RPM, 10, 1e6, "rpm"),
+        Bound("no-load speed of the motors", robot.supply / robot.torque_constant * RPM_PER_RAD_S, 10, 1e6, "rpm"),
         Bound("stall current of the motors", robot.supply / robot.resistance, 0.01, 5000, "A"),
         Bound("losses over the stall torque", loss / stall, 0, 0.9, ""),
     ]
@@ -185,7 +186,8 @@ def _candidates(model: mujoco.MjModel, robot: Robot) -> list[Mistake]:
 
     k, of_constant = robot.torque_constant, f"the motor constant {motors} is {robot.torque_constant:,.4g} V·s/rad"
     for unit, value in (
-        ("mN·m/A", k / 1e3), ("V/rpm", k * RPM), ("V/krpm", k * RPM / 1e3), ("rpm/V", RPM / k), ("kV·s/rad", k * 1e3),
+        ("mN·m/A", k / 1e3), ("V/rpm", k * RPM_PER_RAD_S), ("V/krpm", k * RPM_PER_RAD_S / 1e3),
+        ("rpm/V", RPM_PER_RAD_S / k), ("kV·s/rad", k * 1e3),
     ):  # fmt: skip
         rows.append((of_constant, unit, "V·s/rad, which is N·m/A", {"torque_constant": value}))
     of_mass = f"the mass of {heaviest.name or 'a body'} is {heaviest.mass[0]:,.6g} kg"

@@ -8,15 +8,15 @@
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
-b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. They hardly change. The radii become
-uncertain where encoders and gyro contradict each other although no wheel can slip (`find_radius`), and radii, bias and
-posture where the fixes contradict dead reckoning (`find_drift`). The accelerometer a, corrected for its place ahead of
-the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the commanded
-acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres
-(`theory.robot.Tyres`), and the accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the
-error of an encoder stays bounded in angle; modelled as noise on V, it would become a random walk of the position. The
-noise of a and θ̈ moves the positions of the same period, so that an encoder sees it at once. A fix corrects the state at
-the time when it was taken: the filter stores that state, and repeats the periods since then.
+b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. Bias and radii hardly change. The radii
+become uncertain where encoders and gyro contradict each other although no wheel can slip (`find_radius`), and radii,
+bias and posture where the fixes contradict dead reckoning (`find_drift`). The accelerometer a, corrected for its place
+ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the commanded
+acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and the
+accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the error of an encoder stays bounded
+in angle; modelled as noise on V, it would become a random walk of the position. The noise of a and θ̈ moves the
+positions of the same period, so that an encoder sees it at once. A fix corrects the state at the time when it was
+taken: the filter stores that state, and repeats the periods since then.
 """
 
 from __future__ import annotations

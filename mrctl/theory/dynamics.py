@@ -30,7 +30,8 @@ from mrctl.kernel import Array
 from mrctl.theory.kinematics import split, stack, wheel_rates
 from mrctl.theory.robot import Robot
 
-RPM = 2 * np.pi / 60  # rad/s
+RAD_S_PER_RPM = 2 * np.pi / 60
+"""Rate of one revolution per minute in rad/s."""
 
 
 def common_differential(voltage: ArrayLike) -> Array:
@@ -211,6 +212,6 @@ def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot)
         (printed V̈, θ̈), m/s² and rad/s², shape (…, 2).
     """
     wheel_speed = robot.wheel_radius * wheel_rates(twist, robot)
-    left, right = split(wheel_torques_as_printed(voltage, wheel_speed, robot, robot.torque_constant * RPM))
+    left, right = split(wheel_torques_as_printed(voltage, wheel_speed, robot, robot.torque_constant * RAD_S_PER_RPM))
     r, d = robot.wheel_radius, robot.half_track
     return stack((right + left) / (2 * r * robot.mass), r / (2 * d) * (right - left) / robot.yaw_inertia)

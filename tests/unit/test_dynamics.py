@@ -253,7 +253,7 @@ def test_defect_5_names(robot):
     """One order, (left, right): the right voltage moves the right torque alone and turns left; torque is no input."""
     for torques in (
         lambda u, v: d.wheel_torques(u, [v, 0], robot),
-        lambda u, v: d.wheel_torques_as_printed(u, [v, v], robot, robot.torque_constant * d.RPM),
+        lambda u, v: d.wheel_torques_as_printed(u, [v, v], robot, robot.torque_constant * d.RAD_S_PER_RPM),
     ):
         change = torques([1, 2], 0.0) - torques([1, 1], 0.0)
         assert change[0] == 0 and change[1] == pytest.approx(robot.motor_gain)
