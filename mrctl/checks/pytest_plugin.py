@@ -36,7 +36,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     """Collects the robot's file, and no other."""
-    return RobotFile.from_parent(parent, path=file_path) if file_path == _robot(parent.config) else None
+    return RobotTests.from_parent(parent, path=file_path) if file_path == _robot(parent.config) else None
 
 
 def _robot(config: pytest.Config) -> Path | None:
@@ -45,7 +45,7 @@ def _robot(config: pytest.Config) -> Path | None:
     return (config.invocation_params.dir / name).resolve() if name else None
 
 
-class RobotFile(pytest.File):
+class RobotTests(pytest.File):
     """A robot's file, as a collection of tests."""
 
     def collect(self) -> Iterator[PhysicsCheck]:
