@@ -62,12 +62,12 @@ class Feedforward(Protocol):
         """
         ...
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array | None:
+    def learn(self, feedback: Array, frozen: Array, twist: Array, voltage: Array) -> Array | None:
         """Learns from the feedback that was added to the last `output`, and from the motion of the robot.
 
         Args:
             feedback: Feedback times the guard's gain, in the channels and units of `output`, `(B, 2)`.
-            saturated: 1 where a limit acted, a driven wheel slips, or this robot must not learn, else 0, `(B,)`.
+            frozen: 1 where a limit acted, a driven wheel slips, or this robot must not learn, else 0, `(B,)`.
             twist: Estimated V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
             voltage: Voltage of the coming period, after the limits, in the channels and units of `output`, `(B, 2)`.
 
@@ -256,10 +256,10 @@ class Learner(ABC):
         respond_all.calling(respond=self.respond)(motion, self.robot, self.arrays)
         return np.ascontiguousarray(motion["voltage"])
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
+    def learn(self, feedback: Array, frozen: Array, twist: Array, voltage: Array) -> Array:
         """Lets all robots learn; see `Feedforward.learn`."""
         learn_all.calling(learn_one=self.learn_one)(
-            self._motion, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
+            self._motion, _own(feedback), _own(frozen), _own(twist), _own(voltage), self.period, self.robot,
             self.prior.rows, self.arrays, self._added, self.weight_norm,
         )  # fmt: skip
         return self._added

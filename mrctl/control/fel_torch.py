@@ -121,7 +121,7 @@ class ModuleLearning:
         with torch.no_grad():
             return (self._output_scale * (self._forward(self.state, x) - self._forward(self.initial, x))).numpy()
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
+    def learn(self, feedback: Array, frozen: Array, twist: Array, voltage: Array) -> Array:
         """Does the step of `fel.update` for all robots, with Jᵀe by automatic differentiation."""
         every, oldest = np.arange(len(self._tick)), self._tick % self._queue.shape[1]
         answered = self._tick >= self._queue.shape[1]
@@ -131,7 +131,7 @@ class ModuleLearning:
         fb = torch.from_numpy(np.array(feedback))
         error = torch.where(fb.abs() > self._dead_zone, self._share * fb / self._output_scale, 0.0)
         power = (error**2).sum(1)
-        allowed = torch.from_numpy(answered & (np.asarray(saturated) == 0) & (self._step > 0))
+        allowed = torch.from_numpy(answered & (np.asarray(frozen) == 0) & (self._step > 0))
         active = (power > 0) & allowed
         pull = vjp(lambda state: self._forward(state, past), self.state)[1]
         (gradient,) = pull(error)

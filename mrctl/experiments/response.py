@@ -83,7 +83,7 @@ class Shaker:
         """Returns the signal at this tick, `(B, 2)`."""
         return self._signal[self._tick % len(self._signal)]
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
+    def learn(self, feedback: Array, frozen: Array, twist: Array, voltage: Array) -> None:
         """Records the feedback."""
         self.feedback[self._tick] = feedback
         self._tick += 1

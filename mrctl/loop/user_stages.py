@@ -179,9 +179,9 @@ class UserFeedforward:
         """Returns the feedforward of all robots; see `Feedforward.output`."""
         return self.stage.output(command, derivative)
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array | None:
+    def learn(self, feedback: Array, frozen: Array, twist: Array, voltage: Array) -> Array | None:
         """Lets all robots learn; see `Feedforward.learn`."""
-        added = self.stage.call("learn", feedback, saturated, twist, voltage)
+        added = self.stage.call("learn", feedback, frozen, twist, voltage)
         return None if added is None else self.stage.checked(added, feedback.shape, "what `learn` returns")
 
     def restore(self, rows: NDArray[np.intp]) -> None:

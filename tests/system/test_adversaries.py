@@ -107,7 +107,7 @@ class Adversary:
             return np.array([np.nan, 0.0]) if self.tick // 20 % 10 == 0 else np.zeros(2)
         return np.where(on != 0, np.inf, 0.0)
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         self.error = twist - self.command
         self.past[self.tick % 100] = feedback
         self.sum += 30 * PERIOD * self.gain[:, None] * feedback

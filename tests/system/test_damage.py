@@ -33,7 +33,7 @@ class Half:
         self.gain = 0.5 / robot.velocity_gain, 0.5 / robot.rotation_gain
     def output(self, command, derivative):
         return command * self.gain
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 """
 

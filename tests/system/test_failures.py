@@ -26,7 +26,7 @@ class BreaksAfter:
             self.out[1:2, self.calls % 2] = np.nan
         return self.out
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 

@@ -123,7 +123,7 @@ class Shakes:
             self.out[1:2] = np.nan
         return self.out
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 
@@ -157,7 +157,7 @@ class Takes:
         self.out = np.array([21.0, 5.0]) * command
         return self.out
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         return np.concatenate([self.out[:1], 1e6 * feedback[1:]])
 
 
@@ -194,7 +194,7 @@ class Breaks:
         self.ticks += 1
         return np.array([17.0, 3.0]) * command if self.ticks <= 300 else np.full(command.shape, np.nan)
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 

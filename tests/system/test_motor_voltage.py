@@ -64,7 +64,7 @@ class Demands:
         self.calls += 1
         return np.tile([-40.0 if self.calls > 101 else 1.0, 0.0], (self.size, 1))
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 

@@ -31,9 +31,9 @@ class Own:
         self.x = np.stack([command, derivative], axis=2)
         return command * self.start + (self.gain * self.x).sum(2)
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         self.ticks += 1
-        step = 0.05 * (saturated == 0)[:, None] / (0.1 + (self.x**2).sum(2))
+        step = 0.05 * (frozen == 0)[:, None] / (0.1 + (self.x**2).sum(2))
         self.gain = self.gain + (step * feedback)[:, :, None] * self.x
 
     def restore(self, rows):
@@ -146,7 +146,7 @@ class Forgetful:
     def output(self, command, derivative):
         return np.zeros((self.size, 2))
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 

@@ -225,7 +225,7 @@ class Integrator:
     def output(self, command, derivative):
         return self.voltage
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         self.voltage = self.voltage + self.step * feedback
 
 

@@ -31,7 +31,7 @@ class Scaled:
     def output(self, command, derivative):
         return self.gain * self.model.output(command, derivative)
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 class Plain(Scaled):

@@ -305,7 +305,7 @@ class Silent:
     def output(self, command, derivative):
         return np.zeros_like(command)
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         pass
 
 
@@ -370,7 +370,7 @@ def test_fault_is_in_the_summary():
         def output(self, command, derivative):
             return np.full((self.size, 2), np.nan)
 
-        def learn(self, feedback, saturated, twist, voltage):
+        def learn(self, feedback, frozen, twist, voltage):
             pass
 
     table = mrctl.summary(simulate(THREE, feedforward=Broken))
@@ -394,7 +394,7 @@ def test_feedforward_knows_the_loop():
             assert told
             return np.zeros((self.size, 2))
 
-        def learn(self, feedback, saturated, twist, voltage):
+        def learn(self, feedback, frozen, twist, voltage):
             pass
 
     for tier in ("ideal", "lab", "field"):
@@ -522,7 +522,7 @@ def test_refused_run_has_the_name_of_its_stage(tmp_path):
         "class Pairs:\n"
         "    def __init__(self, robot, size, gain): assert size == 2, 'not two'\n"
         "    def output(self, command, derivative): return 0 * command\n"
-        "    def learn(self, feedback, saturated, twist, voltage): pass\n"
+        "    def learn(self, feedback, frozen, twist, voltage): pass\n"
     )
     sweep = Sweep(base=SHORT, runs=3, chunk=2, controller=f"{file}:Pairs(gain=2)")
     assert jobs.run(sweep, tmp_path / "store", workers=1).failed == 1
@@ -538,7 +538,7 @@ def test_sweep_of_controllers(tmp_path, capsys, monkeypatch):
         "class Gain:\n"
         "    def __init__(self, robot, size, gain): self.gain, self.size = gain, size\n"
         "    def output(self, command, derivative): return self.gain * command\n"
-        "    def learn(self, feedback, saturated, twist, voltage): pass\n"
+        "    def learn(self, feedback, frozen, twist, voltage): pass\n"
         "class Pairs(Gain):\n"
         "    def output(self, command, derivative):\n"
         "        assert self.size == 2, 'not two'\n"

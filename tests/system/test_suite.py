@@ -45,7 +45,7 @@ class Gain:
     def output(self, command, derivative):
         return command * self.gain
 
-    def learn(self, feedback, saturated, twist, voltage):
+    def learn(self, feedback, frozen, twist, voltage):
         self.ticks += 1
 """
 

@@ -289,7 +289,7 @@ def test_take_over(robot):
         def output(self, command, derivative):
             return np.zeros((1, 2))
 
-        def learn(self, feedback, saturated, twist, voltage):
+        def learn(self, feedback, frozen, twist, voltage):
             return self.added
 
     integrals = []
