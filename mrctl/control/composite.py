@@ -318,7 +318,7 @@ COMPOSITE = np.dtype(
 )
 
 
-def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> Array:
+def stationary(settings: Composite, robot: Robot, rigid: bool, has_prior: bool) -> Array:
     """P₀ of weights and disturbance, `(2, 11, 11)` in V²; c are the coefficients of the nominal inverse dynamics.
 
         P₀ = gain² c cᵀ + spread² I
@@ -330,7 +330,7 @@ def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> A
         settings: The settings.
         robot: The nominal robot.
         rigid: Whether channel two is steering.
-        prior: Whether a model is the prior; otherwise the weights are as large as those of a model.
+        has_prior: Whether a model is the prior; otherwise the weights are as large as those of a model.
     """
     c, scale = np.zeros((CHANNELS, REGRESSORS)), feature_scale(robot)
     c[:, :FEATURES] = inverse_coefficients(robot).T * scale
@@ -340,7 +340,7 @@ def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> A
     unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
     P[:, :REGRESSORS, :REGRESSORS] = settings.gain**2 * c[:, :, None] * c[:, None, :]
     P[:, range(REGRESSORS), range(REGRESSORS)] += (settings.spread * unit[:, None]) ** 2
-    if not prior:  # the geometry of a steering channel is known in any case
+    if not has_prior:  # the geometry of a steering channel is known in any case
         P[: 1 if rigid else 2, range(FEATURES), range(FEATURES)] += UNKNOWN_WEIGHT**2
     P[:, REGRESSORS, REGRESSORS] = (settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])) ** 2
     return P
@@ -364,7 +364,7 @@ class CompositeAdaptation(Learner):
         for row, s in zip(rows, settings, strict=True):
             memory, brief_memory = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
             row["f"][:, :REGRESSORS], row["f"][:, REGRESSORS] = memory, brief_memory
-            row["stationary"] = stationary(s, robot, rigid, loop.prior)
+            row["stationary"] = stationary(s, robot, rigid, loop.has_prior)
             row["step"] = s.step * np.array([1.0, STEERING_SHARE if rigid else 1.0])
             row["dead_zone"] = s.dead_zone * unit
             row["noise"] = s.noise * unit

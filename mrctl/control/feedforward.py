@@ -172,7 +172,7 @@ class Loop(NamedTuple):
     """Control period in s."""
     delay: int = 0
     """Delay from measurement to voltage in control periods."""
-    prior: bool = True
+    has_prior: bool = True
     """Whether a model is the prior."""
     seeds: Sequence[int] = ()
     """Seed of each robot, which draws initial weights."""
