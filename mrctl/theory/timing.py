@@ -8,8 +8,8 @@ motion along it has
 so that every limit is |a u + b x + c √x + d| ≤ 1 with coefficients that depend on s alone. That includes the motor
 voltages, because the inverse of equation (3) is linear in the features of `mrctl.theory.dynamics.regressor`; c is their
 back-EMF and d their friction. V is not negative here: a curve with cusps is several paths, each with a law of its own.
-Where the robot drives one in reverse, its law keeps `Limits.in_reverse`, and `mrctl.theory.references` changes the signs
-of V and V̇.
+Where the robot drives one in reverse, its law keeps `Limits.in_reverse`, and `mrctl.theory.references` changes the
+signs of V and V̇.
 
 `fastest` finds the law that takes the least time: a backward pass finds at each place the largest x from which the
 limits can be kept up to the end, and a forward pass accelerates as hard as this bound and the limits allow (Pham and
