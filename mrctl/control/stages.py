@@ -8,13 +8,13 @@ prefilter of the command, the limits of voltage and steering angle, and the guar
 Estimated posture and twist are predicted over the delay of the sensing tier, to the time at which the voltage of the
 tick reaches the motors; the reference is that of the same time.
 
-| stage         | `output` returns                                    | other method                                 |
-| ------------- | --------------------------------------------------- | -------------------------------------------- |
-| `Motion`      | requested twist from posture and reference          | `reset` before the first tick                |
-| `Feedback`    | voltages from commanded and estimated twist         | `reset` to the voltages of the initial motion |
-| `Feedforward` | voltages from commanded twist and its derivative    | `learn` from the feedback and the motion     |
-| `Steering`    | angle and rate of the fork from commanded twist     | `reset` to the initial angle                 |
-| `Estimator`   | posture and twist from the samples of the sensors   | `reset` to a first estimate                  |
+| stage            | `output` returns                                  | other method                                  |
+| ---------------- | ------------------------------------------------- | --------------------------------------------- |
+| `MotionStage`    | requested twist from posture and reference        | `reset` before the first tick                 |
+| `FeedbackStage`  | voltages from commanded and estimated twist       | `reset` to the voltages of the initial motion |
+| `Feedforward`    | voltages from commanded twist and its derivative  | `learn` from the feedback and the motion      |
+| `SteeringStage`  | angle and rate of the fork from commanded twist   | `reset` to the initial angle                  |
+| `EstimatorStage` | posture and twist from the samples of the sensors | `reset` to a first estimate                   |
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
 
 
-class Motion(Protocol):
+class MotionStage(Protocol):
     """The motion controller: it requests the twist that brings the robot to its reference, once in a motion period.
 
     It may have a method `assign(scenarios)`, which gets the `mrctl.Scenario` of each robot before all other methods, as
@@ -76,7 +76,7 @@ class Motion(Protocol):
         ...
 
 
-class Feedback(Protocol):
+class FeedbackStage(Protocol):
     """The velocity controller without its feedforward; it is called once in a control period.
 
     It may have a member `integral`, a float64 array `(B, 2)`. The hierarchy then subtracts from it a share of what a
@@ -107,7 +107,7 @@ class Feedback(Protocol):
         ...
 
 
-class Steering(Protocol):
+class SteeringStage(Protocol):
     """The law of the steered fork, which is called once in a control period."""
 
     def reset(self, angle: Array, period: float) -> None:
@@ -133,7 +133,7 @@ class Steering(Protocol):
         ...
 
 
-class Estimator(Protocol):
+class EstimatorStage(Protocol):
     """The estimator of posture and twist, which is called once in a control period.
 
     Its estimate is predicted to the time at which the voltage of the period acts. If the estimate of a robot is not
@@ -174,11 +174,11 @@ Factory = Callable[[Robot, int], Stage]
 class Stages(TypedDict, total=False):
     """Factories of a user's own stages, by the names of the stages that they replace."""
 
-    motion: Factory[Motion] | None
-    feedback: Factory[Feedback] | None
+    motion: Factory[MotionStage] | None
+    feedback: Factory[FeedbackStage] | None
     feedforward: Factory[Feedforward] | None
-    steering: Factory[Steering] | None
-    estimator: Factory[Estimator] | None
+    steering: Factory[SteeringStage] | None
+    estimator: Factory[EstimatorStage] | None
 
 
 METHODS = {name: ("output", "learn" if name == "feedforward" else "reset") for name in Stages.__annotations__}

@@ -34,6 +34,9 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
     quasi-static angle φ_c = atan(L θ̇/V) − asin(t θ̇/speed) with a lag of t/speed. At rest the angle is held. In reverse
     V and L θ̇ change their signs.
 
+    The rate is the derivative of φ_c behind the same lag. It therefore leaves out how the fork catches up where φ_c
+    jumps: when a robot leaves rest on an arc, the rate is that of the angle only some lags later.
+
     Args:
         v: V in m/s.
         omega: θ̇ in rad/s.

@@ -246,5 +246,5 @@ class UserHierarchy(Hierarchy):
 
 
 def _numbers(goal: Rows) -> Array:
-    """Returns records of `GOAL` as the reference of `mrctl.control.stages.Motion`, `(B, 7)`."""
+    """Returns records of `GOAL` as the reference of `mrctl.control.stages.MotionStage`, `(B, 7)`."""
     return goal.view(float).reshape(len(goal), -1)

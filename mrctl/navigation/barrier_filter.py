@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mrctl.control.stages import Motion
+from mrctl.control.stages import MotionStage
 from mrctl.kernel import Array, kernel
 from mrctl.navigation.barrier import Barrier, half_planes, scratch
 from mrctl.navigation.sight import Sight
@@ -43,7 +43,7 @@ class Avoiding:
     Obstacles on the map are known; the others are seen by the lidar, and taken where they are, as if they stood.
     """
 
-    def __init__(self, robot: Robot, size: int, motion: Callable[[Robot, int], Motion], barrier: Barrier) -> None:
+    def __init__(self, robot: Robot, size: int, motion: Callable[[Robot, int], MotionStage], barrier: Barrier) -> None:
         """Makes the stage.
 
         Args:
@@ -61,7 +61,7 @@ class Avoiding:
             take(scenarios)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
-        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._motion.reset(pose, reference, period)
         self._time, self._period = 0.0, period
         for sight in self._sights:
@@ -81,11 +81,11 @@ class Avoiding:
 
     @property
     def followed(self) -> Array | None:
-        """What the robots follow, as in `mrctl.control.stages.Motion`."""
+        """What the robots follow, as in `mrctl.control.stages.MotionStage`."""
         return getattr(self._motion, "followed", None)
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.MotionStage`."""
         requests = np.asarray(self._motion.output(pose, twist, reference))
         around = [sight.outlines(self._time) for sight in self._sights]
         self._time += self._period

@@ -47,7 +47,7 @@ class Mppi(Reactive):
         self._lag = lag
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
-        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
         super().reset(pose, reference, period)
         self._nominal = np.zeros((len(pose), STEPS, 2))
         self._twists, self._costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)

@@ -43,7 +43,7 @@ class Following:
         self._gains[row] = gains.k_x, gains.k_y, gains.k_theta
 
     def output(self, pose: Array, reference: Array) -> Array:
-        """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.MotionStage`."""
         requests = np.empty((len(pose), 2))
         follow_all.compiled(pose, reference, self._gains, np.empty(3), requests)
         return requests
@@ -222,7 +222,7 @@ class Pacing:
     if the plan cannot begin with about the speed of the robot, it stops first.
 
     Attributes:
-        followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
+        followed: What the robots follow, as in `mrctl.control.stages.MotionStage`, `(B, 7)`.
     """
 
     def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
@@ -244,7 +244,7 @@ class Pacing:
         self._law.tune(row, gains)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
-        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._period, self._tick, self.followed = period, 0, reference
         self._pacers = [Pacer(planner, self._robot, period) for planner in self._planners]
 
@@ -258,11 +258,11 @@ class Pacing:
         self._pacers[row].take(plan, self._now)
 
     def see(self, row: int, scan: Scan) -> None:
-        """Takes a scan of one robot; for the arguments see `mrctl.control.stages.Motion`."""
+        """Takes a scan of one robot; for the arguments see `mrctl.control.stages.MotionStage`."""
         self._pacers[row].see(scan)
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.MotionStage`."""
         for pacer, place, (velocity, _) in zip(self._pacers, pose, twist, strict=True):
             pacer.replan(place, float(velocity), self._now)
         self.followed = np.stack([pacer.reference for pacer in self._pacers])

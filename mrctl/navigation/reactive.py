@@ -269,7 +269,7 @@ class Reactive(ABC):
         self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
-        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
         discs, fields = cover(self._planners[0].vehicle.footprint, *BODY_DISCS), dict[Hashable, Field]()
@@ -285,7 +285,7 @@ class Reactive(ABC):
         self._agents[row].follow(plan, self._period * self._tick)
 
     def see(self, row: int, scan: Scan) -> None:
-        """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
+        """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._agents[row].see(scan)
 
     @property
@@ -294,7 +294,7 @@ class Reactive(ABC):
         return np.stack([agent.last for agent in self._agents])
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """Returns twists that the robots can drive, `(B, 2)`; arguments are those of `mrctl.control.stages.Motion`."""
+        """Returns twists that the robots can drive, `(B, 2)`; the arguments are those of `stages.MotionStage`."""
         self.begin(self._tick)
         now = self._period * self._tick
         for row, (agent, place) in enumerate(zip(self._agents, pose, strict=True)):

@@ -11,7 +11,7 @@ import xarray as xr
 
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
-from mrctl.control.stages import Motion, Stages
+from mrctl.control.stages import MotionStage, Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, run, uniform
 from mrctl.loop.timeline import followed, state
@@ -71,7 +71,7 @@ class Session:
         self.avoid: Avoid = avoid
         motion, self._stages = avoiding(avoid), []
 
-        def kept(robot: Robot, size: int) -> Motion:
+        def kept(robot: Robot, size: int) -> MotionStage:
             assert motion is not None
             self._stages.append(motion(robot, size))
             return self._stages[-1]
