@@ -34,7 +34,7 @@ MODEL_BASED = tuple(name for name, law in LEARNERS.items() if law.needs_model)
 """Learners that compare the robot with a model, so that the prior must be a model."""
 
 
-def named(prior: str, learner: str) -> str:
+def feedforward_name(prior: str, learner: str) -> str:
     """Returns the name of a feedforward in tables: `none`, `model`, `fel`, or `model+fel` for both."""
     return "+".join(part for part in (prior, learner) if part != "none") or "none"
 
@@ -43,7 +43,9 @@ FeedforwardName = Literal[
     "none", "model", "true_model", "model+observer", "model+indi", "model+l1", "fel", "model+fel", "rls", "model+rls",
     "mrac", "model+mrac", "composite", "model+composite",
 ]  # fmt: skip
-_PAIRS = {named(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)}
+_PAIRS = {
+    feedforward_name(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)
+}
 FEEDFORWARDS: dict[FeedforwardName, dict[str, Any]] = {name: _PAIRS[name] for name in get_args(FeedforwardName)}
 """Pairs of a prior and a learner, as fields of a scenario, by their names."""
 COMPARED: tuple[FeedforwardName, ...] = tuple(
@@ -212,7 +214,7 @@ class Scenario(Record):
     @property
     def feedforward(self) -> str:
         """Name of prior and learner in tables."""
-        return named(self.prior, self.learner)
+        return feedforward_name(self.prior, self.learner)
 
     @property
     def duration(self) -> float:

@@ -57,7 +57,9 @@ UNKNOWN_WEIGHT = 6.0  # V, standard deviation of the weights of the eight featur
 
 
 @kernel
-def regressor(twist: Array, rate: Array, direction: Array, half_track: float, scale: Array, phi: Array) -> None:
+def composite_regressor(
+    twist: Array, rate: Array, direction: Array, half_track: float, scale: Array, phi: Array
+) -> None:
     """The ten features φ of a motion, followed by a one for the disturbance.
 
     Args:
@@ -204,7 +206,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     """U = φ(x_c)ᵀ a + d at the commanded motion x_c."""
     rows, scale, _ = arrays
     s = rows[i]
-    regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
+    composite_regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
     for k in range(CHANNELS):
         voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, REGRESSORS]
 
@@ -226,7 +228,7 @@ def learn(
     motion = s.twice
     moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > STICTION_SPEED
     if moves and s.age > SETTLING_TIMES and frozen == 0:
-        regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
+        composite_regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
         explained(motion.twist, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
             s.residual[k] = motion.voltage[k] - s.residual[k]

@@ -86,12 +86,12 @@ def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: fl
 @lru_cache(maxsize=256)
 def _design(robot: Robot, rigid: bool, delay: float, lag: float, period: float) -> tuple[Gains, Gains]:
     electric = robot.inductance / robot.resistance  # s, time constant of the armature, which counts as a lag
-    common = fastest(plants(robot, rigid, 0), period, delay, lag + electric)
-    second = fastest(plants(robot, rigid, 1), period, delay, lag if rigid else lag + electric)
+    common = fastest_pi(plants(robot, rigid, 0), period, delay, lag + electric)
+    second = fastest_pi(plants(robot, rigid, 1), period, delay, lag if rigid else lag + electric)
     return common, second
 
 
-def fastest(plants: list[Linear], period: float, delay: float, lag: float) -> Gains:
+def fastest_pi(plants: list[Linear], period: float, delay: float, lag: float) -> Gains:
     """Returns the PI gains with the largest K_i that keep `M_S` and `M_T` with every one of some stable plants.
 
     Args:

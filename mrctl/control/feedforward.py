@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.features import features, linear
 from mrctl.control.nominal import nominal
-from mrctl.control.weights import named
+from mrctl.control.weights import arrays_by_name
 from mrctl.kernel import Array, Kernel, Row, Rows, flat, kernel
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
@@ -238,7 +238,7 @@ class Learner(ABC):
 
     def adopt(self, row: int, learned: Array) -> None:
         """Lets one robot start from what another one has learned, a row of its `adapted`."""
-        for name, values in named(learned, {name: self.rows[name].shape[1:] for name in self.learned}).items():
+        for name, values in arrays_by_name(learned, {name: self.rows[name].shape[1:] for name in self.learned}).items():
             self.rows[name][row] = values
 
     def take(self, row: int, other: Learner) -> None:

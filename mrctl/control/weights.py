@@ -48,7 +48,7 @@ def flatten(layers: dict[str, Array]) -> Array:
 
 def unflatten(weights: Array) -> dict[str, Array]:
     """Returns the flat vector as named weights."""
-    return named(weights, shapes(hidden_units(len(weights))[0]))
+    return arrays_by_name(weights, shapes(hidden_units(len(weights))[0]))
 
 
 def hidden_units(size: int) -> tuple[int, int]:
@@ -56,7 +56,7 @@ def hidden_units(size: int) -> tuple[int, int]:
     return divmod(size - CHANNELS * (FEATURES + 1), FEATURES + 1 + CHANNELS)
 
 
-def named(flat: Array, layout: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+def arrays_by_name(flat: Array, layout: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
     """Returns views of a flat vector as arrays of these names and shapes, which follow each other in it."""
     found, start = {}, 0
     for name, shape in layout.items():

@@ -27,7 +27,7 @@ from mrctl.loop.simulation import Simulation
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
-from mrctl.scenario import MODEL_BASED, Scenario, named
+from mrctl.scenario import MODEL_BASED, Scenario, feedforward_name
 
 WITHOUT_MAP = ("none", "model", *REFERENCES, *(f"model+{name}" for name in MODEL_BASED))
 """Feedforwards that learn no map from motion to voltage."""
@@ -202,7 +202,7 @@ def command(outcome: Outcome, choices: Choices) -> str:
 
 def controllers(choices: Choices) -> list[str]:
     """Returns the user's controllers, as on the command line."""
-    return [named(one.prior, one.controller) for one in choices.values() if one.controller]
+    return [feedforward_name(one.prior, one.controller) for one in choices.values() if one.controller]
 
 
 def _worlds(outcome: Outcome) -> int:

@@ -42,7 +42,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
-from mrctl.scenario import FEEDFORWARDS, Scenario, named, replicates
+from mrctl.scenario import FEEDFORWARDS, Scenario, feedforward_name, replicates
 from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 from mrctl.sweep.store import Store
@@ -114,7 +114,7 @@ def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str]) -> Choice
     choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
     for entry in controllers:
         prior, stages, parts = user_files.behind(entry)
-        name = named(prior, "+".join(part.title for part in parts))
+        name = feedforward_name(prior, "+".join(part.title for part in parts))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
         own = user_files.absolute(stages)

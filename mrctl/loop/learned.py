@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from mrctl.control.learners import LEARNERS
-from mrctl.control.weights import named, notes_on, read_arrays, write_arrays
+from mrctl.control.weights import arrays_by_name, notes_on, read_arrays, write_arrays
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import scenarios_of
@@ -57,7 +57,7 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         learner, layout = own["learner"], own["shapes"]
     else:
         learner, layout = scenario.learner, kept(scenario)
-    arrays = named(one.weights.values, layout)
+    arrays = arrays_by_name(one.weights.values, layout)
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise InputError(f"learned: {name} of {learner} is not finite, and no run could start from it")

@@ -30,7 +30,7 @@ from mrctl.physics import obstacles as walls
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results import dataset
-from mrctl.scenario import Event, Scenario, named
+from mrctl.scenario import Event, Scenario, feedforward_name
 from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
@@ -109,7 +109,7 @@ def titles(scenario: Scenario, stages: Mapping[str, str]) -> tuple[str, str]:
         stages: Names of the user's factories by stage.
     """
     others = dict(stages)
-    feedforward = named(scenario.prior, others.pop("feedforward", scenario.learner))
+    feedforward = feedforward_name(scenario.prior, others.pop("feedforward", scenario.learner))
     return " + ".join([feedforward, *others.values()]), feedforward
 
 

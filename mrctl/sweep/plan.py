@@ -25,7 +25,7 @@ from tqdm import tqdm
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import FAULTS, SIGNALS
 from mrctl.results.metrics import METRICS
-from mrctl.scenario import FEEDFORWARDS, Scenario, named
+from mrctl.scenario import FEEDFORWARDS, Scenario, feedforward_name
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
@@ -65,7 +65,7 @@ class Chosen(NamedTuple):
         prior, own, parts = user_files.behind(value)
         alone = any(part.stage == "feedforward" for part in parts)
         fields = {"prior": prior, "learner": "none"} if alone else {}
-        return cls(named(prior, "+".join(part.title for part in parts)), own, fields)
+        return cls(feedforward_name(prior, "+".join(part.title for part in parts)), own, fields)
 
 
 class Grid(Record):

@@ -13,8 +13,8 @@ from mrctl.control.composite import (
     STEERING_DISTURBANCE,
     Composite,
     CompositeAdaptation,
+    composite_regressor,
     predict,
-    regressor,
     track,
 )
 from mrctl.control.features import feature_scale
@@ -115,7 +115,7 @@ def test_regressor(robot, twist, rate, heading):
     """φ is the regressor of equation (3) over its scales, the direction of the heading, and a one."""
     scale, phi = feature_scale(robot), np.empty(N + 1)
     direction = np.array([np.cos(heading), np.sin(heading)])
-    regressor(twist, rate, direction, robot.half_track, scale, phi)
+    composite_regressor(twist, rate, direction, robot.half_track, scale, phi)
     expected = dynamics.regressor(twist, rate, robot, sign_speed=0.05) / scale
     np.testing.assert_allclose(phi, [*expected, *direction, 1], atol=1e-14)
 

@@ -18,7 +18,7 @@ from mrctl.control.design import (
     PUBLISHED_K_X,
     SPEED_SHARES,
     design,
-    fastest,
+    fastest_pi,
     motion,
     plants,
     sensitivity,
@@ -70,7 +70,7 @@ def peaks(plant, gains, periods, h=H):
 def test_keeps_its_bounds(tau, gain, periods):
     """The closed loop is stable, keeps both bounds, and touches one of them."""
     plant = first_order(gain, tau)
-    s, t = peaks(plant, fastest([plant], H, periods * H, 0.0), periods)
+    s, t = peaks(plant, fastest_pi([plant], H, periods * H, 0.0), periods)
     assert s <= M_S * 1.002 and t <= M_T * 1.002
     assert s >= M_S * 0.998 or t >= M_T * 0.998
 
@@ -89,7 +89,7 @@ def test_nothing_integrates_faster(tau, periods):
         closed = np.abs(1 / (1 + loop))
         return closed.max() > 1.002 * M_S or (np.abs(loop) * closed).max() > 1.002 * M_T
 
-    found = fastest([plant], H, periods * H, 0.0)
+    found = fastest_pi([plant], H, periods * H, 0.0)
     assert not breaks(*found)
     faster = (
         (k_p, k_i) for k_p in found.k_p * np.geomspace(0.2, 3, 60) for k_i in found.k_i * np.geomspace(1.01, 2, 30)
@@ -101,8 +101,8 @@ def test_nothing_integrates_faster(tau, periods):
 @settings(max_examples=20)
 def test_dimensions(tau, gain, factor):
     """A plant with a times the gain gets gains 1/a as large; with all times b times as long, K_i becomes K_i/b."""
-    base = fastest([first_order(1.0, tau)], H, H, 0.0)
-    scaled = fastest([first_order(gain, factor * tau)], factor * H, factor * H, 0.0)
+    base = fastest_pi([first_order(1.0, tau)], H, H, 0.0)
+    scaled = fastest_pi([first_order(gain, factor * tau)], factor * H, factor * H, 0.0)
     np.testing.assert_allclose([scaled.k_p, scaled.k_i], [base.k_p / gain, base.k_i / gain / factor], rtol=1e-3)
 
 
