@@ -6,6 +6,7 @@ import pytest
 import mrctl
 from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, Fel, InputError, Lemniscate, Scenario, Sensing
 from mrctl.control import learners
+from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.learned import load_learned
 from mrctl.loop.simulation import Simulation
 
@@ -62,7 +63,7 @@ def test_beside_another_feedforward(files):
         other = first.with_feedforward(name)
         assert (other.feedforward, other.learned, other.name) == (name, None, "")
         assert Simulation([other]).ticks == Simulation([first]).ticks
-    assert not mrctl.loop.hindsight.best_fixed([first]).failed.any()
+    assert not best_fixed([first]).failed.any()
 
 
 @pytest.mark.parametrize("name", LEARNERS[:5])
