@@ -122,8 +122,9 @@ class TrackingEnv(gymnasium.Env):
 
         Returns:
             Observation `(n,)`, reward, whether the robot has failed or arrived, whether the scenario is at its end, and
-            a dictionary, which is empty before the end of the episode. Then it holds the `metrics`, and `failure` if
-            the robot has failed or arrived: the reason, or "" for an arrival. The metrics of a failure are NaN.
+            a dictionary, which is empty before the end of the episode. Then it holds the errors of the episode as
+            `v_rmse`, `omega_rmse` and `position_rmse` in m/s, rad/s and m, NaN after a failure, but in `NavigationEnv`
+            none of them; and `failure` if the robot has failed or arrived: the reason, or "" for an arrival.
 
         Raises:
             InputError: The action has another shape, or holds no real numbers.
