@@ -157,7 +157,10 @@ def clopper_pearson(count: int, n: int, level: float = 0.95) -> tuple[float, flo
 
 
 def wilson(share: float, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Returns Wilson's (1927) score interval of a share of n trials."""
+    """Returns Wilson's (1927) score interval of a share of n trials, which without any is from 0 to 1."""
+    _check_level(level)
+    if not n:
+        return 0.0, 1.0
     z = NormalDist().inv_cdf((1 + level) / 2)
     centre, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
     low, high = (float(np.clip((centre + sign * half) / (1 + z * z / n), 0, 1)) for sign in (-1, 1))
@@ -169,21 +172,26 @@ def quantile_interval(samples: ArrayLike, share: float, level: float = 0.95) -> 
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed, which counts as infinite.
-        share: Share of the samples that are at most the quantile, between 0 and 1.
+        share: Share of the samples that are at most the quantile, above 0 and at most 1.
         level: Confidence level, between 0 and 1.
 
     Returns:
         The least sample that is not exceeded by this share of the samples. An end of the interval is infinite where
         there are too few samples for it. `samples` counts the finite ones.
+
+    Raises:
+        InputError: `share` or `level` is out of range.
     """
     from scipy.stats import binom  # the import takes 0.4 s
 
+    _check_share(share)
+    _check_level(level)
     values = np.asarray(samples, float).ravel()
     fine = np.isfinite(values)
     ordered, n = np.sort(np.where(fine, values, np.inf)), len(values)
     low, high = (int(rank) for rank in binom.ppf([(1 - level) / 2, (1 + level) / 2], n, share))
     ends = np.concatenate([[-np.inf], ordered, [np.inf]])  # the number of samples up to the quantile is binomial
-    value = float(ordered[int(np.ceil(share * n - 1e-9)) - 1]) if n else np.nan
+    value = float(ordered[max(int(np.ceil(share * n - 1e-9)), 1) - 1]) if n else np.nan
     return Interval(value, float(ends[low]), float(ends[high + 1]), int(fine.sum()), int((~fine).sum()))
 
 
@@ -203,8 +211,7 @@ def cvar(samples: ArrayLike, share: float = 0.05) -> float:
     Raises:
         InputError: `share` is out of range.
     """
-    if not 0 < share <= 1:
-        raise InputError(f"share: {share} is not above 0 and at most 1")
+    _check_share(share)
     values = np.asarray(samples, float).ravel()
     worst = np.sort(np.where(np.isfinite(values), values, np.inf))[::-1]
     if not len(worst):
@@ -241,6 +248,12 @@ def _check_level(level: float) -> None:
     """Raises `InputError` if a confidence level is not between 0 and 1."""
     if not 0 < level < 1:
         raise InputError(f"level: {level} is not between 0 and 1")
+
+
+def _check_share(share: float) -> None:
+    """Raises `InputError` if a share is not above 0 and at most 1."""
+    if not 0 < share <= 1:
+        raise InputError(f"share: {share} is not above 0 and at most 1")
 
 
 def _interval(

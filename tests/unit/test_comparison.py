@@ -157,6 +157,10 @@ def test_cvar_by_hand():
         (lambda: comparison.paired_ratio([1, 2], [1]), "b"),
         (lambda: comparison.superiority([1], [1, 2]), "b"),
         (lambda: comparison.cvar([1], share=0), "share"),
+        (lambda: comparison.quantile_interval([1, 2, 3], 1.5), "share"),
+        (lambda: comparison.quantile_interval([1, 2, 3], 0.0), "share"),
+        (lambda: comparison.quantile_interval([1, 2, 3], 0.5, level=95), "level"),
+        (lambda: comparison.wilson(0.5, 10, level=1), "level"),
     ],
 )
 def test_bad_input(call, field):
@@ -177,6 +181,7 @@ def test_quantile_interval():
     found = [comparison.quantile_interval(random.exponential(size=80), 0.95) for _ in range(500)]
     held = [one.low <= -np.log(0.05) <= one.high for one in found]
     assert 0.94 <= np.mean(held) <= 0.99
+    assert comparison.quantile_interval([3, 1, 2], 1e-12).value == 1 and comparison.wilson(0.0, 0) == (0.0, 1.0)
     few = comparison.quantile_interval([3, 1, np.nan, 2], 0.75)
     assert few == (3, 1, np.inf, 3, 1)
     assert comparison.quantile_interval(np.arange(71.0), 0.95).high == np.inf > 71  # 0.95⁷¹ > 0.025
