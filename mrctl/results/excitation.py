@@ -94,7 +94,8 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
         until the window is full and after a failure.
 
     Raises:
-        InputError: The result lacks a variable, there is no such motion, or the window is shorter than two samples.
+        InputError: The result lacks a variable, there is no such motion, or the window is not finite or is shorter than
+            two samples.
     """
     if motion not in MOTIONS:
         raise InputError(f"motion: {motion!r} is not one of {', '.join(MOTIONS)}")
@@ -102,6 +103,8 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
     require(result, ("time", "half_track", "feature_scale", *names))
     runs = as_runs(result)
     period = control_period(runs)
+    if not np.isfinite(window):
+        raise InputError(f"window: {window} s is not finite")
     samples = round(window / period)
     if samples < 2:
         raise InputError(f"window: {window:g} s is shorter than two samples of {period:g} s")

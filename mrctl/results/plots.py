@@ -179,10 +179,16 @@ def velocities(
     window: tuple[float, float] | None = None,
     lap: int | None = None,
 ) -> Figure:
-    """Draws linear velocity and yaw rate, or one of them, over time with the original reference (paper's figure 4)."""
+    """Draws linear velocity and yaw rate, or one of them, over time with the original reference (paper's figure 4).
+
+    Raises:
+        InputError: `signals` is empty or holds another name than `v` and `omega`.
+    """
+    texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
+    if not signals or not set(signals) <= set(texts):
+        raise InputError(f"signals: {', '.join(signals) or 'nothing'} is not one or both of {', '.join(texts)}")
     figure, axes = _figure(COLUMN_WIDTH, (0.1 + 0.4 * len(signals)) * COLUMN_WIDTH, rows=len(signals))
     curves = _curves(result, window, lap)
-    texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
     for one, name in zip(axes, signals, strict=True):
         _references(one, curves, "time", f"{name}_ref")
         _signals(one, curves, name, texts[name])

@@ -116,6 +116,9 @@ def test_refused(robot):
     runs = result(robot, RNG.uniform(0.1, 1, (1, 50, 2)))
     with pytest.raises(InputError, match="window: 0.01 s is shorter"):
         excitation(runs, 0.01)
+    for window in (np.nan, np.inf):
+        with pytest.raises(InputError, match=f"^window: {window} s is not finite$"):
+            excitation(runs, window)
     with pytest.raises(InputError, match="motion: 'seen' is not one of commanded, true"):
         excitation(runs, 0.1, "seen")
     with pytest.raises(InputError, match="parameters: not a variable"):

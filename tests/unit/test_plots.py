@@ -432,6 +432,8 @@ def test_leaves_settings_alone():
     [
         (lambda r: plots.path(r, lap=0), "lap"),
         (lambda r: plots.path(r, lap=4), "lap"),
+        (lambda r: plots.velocities(r, ("v", "power")), "signals"),
+        (lambda r: plots.velocities(r, ()), "signals"),
         (lambda r: plots.errors(r, window=(3, 1)), "window"),
         (lambda r: plots.errors(r, window=(90, 91)), "window"),
         (lambda r: plots.errors(r, window=(0, 1), lap=1), "window"),
