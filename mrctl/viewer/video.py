@@ -70,7 +70,8 @@ def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
     library = Library(folder, code)
     shown = [int(k) for k in library.table.index] if run is None else [run]
     recordings = [library.recording(k) for k in (shown if len(shown) <= MAX_SHOWN else shown[:1])]
-    times = np.arange(0, max(r.duration for r in recordings), 1 / RATES[out.suffix])
+    period = 1 / RATES[out.suffix]
+    times = np.arange(0, max(period, *(r.duration for r in recordings)), period)  # one picture of a single sample
     pictures = _pictures(recordings, looks_of(recordings, shown), times, *SIZES[out.suffix])
     progress = tqdm(pictures, total=len(times), unit="picture")
     try:

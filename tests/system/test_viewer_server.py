@@ -309,11 +309,13 @@ def _random_value(handle, rng):
 
 def test_record(tmp_path, capsys):
     """GIF and MP4 of a result show the robot on its way; where MuJoCo cannot draw, one line says so."""
-    result = tmp_path / "result.zarr"
-    save(simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")]), result)
+    result, driven = tmp_path / "result.zarr", simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")])
+    save(driven, result)
+    save(driven.isel(time=slice(0, 1)), tmp_path / "sample.zarr")
     gif, mp4 = (["record", str(result), "--out", str(tmp_path / name)] for name in ("run.gif", "run.mp4"))
+    one = ["record", str(tmp_path / "sample.zarr"), "--out", str(tmp_path / "one.gif")]
     few = "from mrctl.viewer import video; video.RATES['.mp4'] = 5.0"  # pictures a second, for they take long to draw
-    code = f"from mrctl.cli import main; gif = main({gif}); {few}; raise SystemExit(gif or main({mp4}))"
+    code = f"from mrctl.cli import main; gif = main({gif}) or main({one}); {few}; raise SystemExit(gif or main({mp4}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
     if done.returncode:
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and "EGL" in done.stderr
@@ -326,6 +328,8 @@ def test_record(tmp_path, capsys):
             assert (np.abs(last - first).max(axis=-1) > 60).sum() > 500
             (own,) = looks([""], ["none"])  # of the trail and the label
             assert (np.abs(last - own.colour).max(axis=-1) < 40).sum() > 100
+        with Image.open(tmp_path / "one.gif") as video:
+            assert (video.n_frames, video.size) == (1, (640, 360))  # of the one sample
         about, *pictures = imageio_ffmpeg.read_frames(tmp_path / "run.mp4")
         assert (about["size"], about["fps"], len(pictures)) == ((1280, 720), 5, 5)
         first, last = (np.frombuffer(pictures[k], np.uint8).reshape(-1, 3).astype(float) for k in (0, -1))
