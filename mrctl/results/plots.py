@@ -378,7 +378,8 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
         unused.remove()
     handles = [Line2D([], [], **_line(k)) for k in range(len(lost))]
     names = [_counted(label, sum(failed), len(failed)) for label, failed in lost.items()]
-    figure.legend(handles, names, loc="outside upper center", ncols=min(4, len(names)))
+    columns = 3 if any(map(any, lost.values())) else 4  # the counts make the names longer
+    figure.legend(handles, names, loc="outside upper center", ncols=min(columns, len(names)))
     return figure
 
 

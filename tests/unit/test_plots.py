@@ -367,6 +367,16 @@ def test_mean_of_the_runs_that_finished():
     np.testing.assert_allclose(thick[1].get_ydata(), [2500])
 
 
+def test_legend_fits_the_page():
+    """The names of twelve controllers with the counts of their failures are within the figure."""
+    laps = metrics.per_lap(make([name for name in list(FEEDFORWARDS)[-12:] for _ in range(10)]))
+    laps["failed"][:] = True
+    figure = plots.laps_by_case({"one": laps, "other": laps}, "energy")
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+
+
 def test_distributions():
     """The share of all runs, so that one that failed keeps its line below one."""
     figure = plots.distributions({"fel": np.array([3.0, np.nan, 1.0, 2.0])}, "ratio")
