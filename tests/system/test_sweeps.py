@@ -34,6 +34,7 @@ from mrctl.sweep.jobs import compute
 from mrctl.sweep.pool import JobOutcome
 from mrctl.sweep.store import KIND, Store
 
+HERE = pytest.mark.usefixtures("here")  # where worker processes are not the point
 KILLS = [moment if moment < 1 else pytest.param(moment, marks=pytest.mark.full) for moment in range(36)]  # per victim
 FILE = """
 runs = 12
@@ -155,6 +156,7 @@ def test_open(sweep, finished):
     assert opened.attrs["control_period"] == 0.01
 
 
+@HERE
 def test_metrics_only(file, tmp_path):
     """Without signals the dataset has the metrics; runs that differ in control period are welcome."""
     file.write_text(
@@ -170,6 +172,7 @@ def test_metrics_only(file, tmp_path):
     assert not (tmp_path / "store" / "signals.zarr").exists()
 
 
+@HERE
 def test_every_lap(tmp_path):
     """A store of laps opens as what `per_lap` returns, shorter runs ending in NaN; a run of it repeats."""
     axes = [{"field": "laps", "values": [1, 3]}, {"field": "perturbation.mass_factor", "values": [1.0, 1.5]}]
@@ -186,6 +189,7 @@ def test_every_lap(tmp_path):
     assert jobs.repeat(tmp_path / "store", 3) == ("bit-identical", True)
 
 
+@HERE
 def test_full_with_runs_of_different_length(tmp_path):
     """Shorter runs end in NaN; a run that diverges says when and why and costs only itself."""
     push = {"time": 0.5, "push": [4000.0, 4000.0, 0.0]}
@@ -202,6 +206,7 @@ def test_full_with_runs_of_different_length(tmp_path):
         assert finite[run] == round(float(opened["failure_time"][run]) * 100) - 1 > 50
 
 
+@HERE
 def test_times_of_another_control_period(tmp_path):
     """The time axis of a store is that of its runs, whatever the period of the base is."""
     scenario = mrctl.Scenario(
@@ -239,6 +244,7 @@ def test_run_again(sweep, store, tmp_path, capsys):
 # --- refusals -------------------------------------------------------------------------------------
 
 
+@HERE
 def test_sweep_of_another_processor(file, tmp_path, whole):
     """A sweep goes on where its numbers differ from those of the store by rounding; the store keeps its own."""
     (tmp_path / "begun").mkdir()
@@ -300,6 +306,7 @@ def aged(store, version="0.1.0", drop=(), **manifest):
 OLD = {KIND: 1, "signals": None}  # format 1 did not say which signals it kept
 
 
+@HERE
 @pytest.mark.parametrize("record", ["metrics", "laps", "decimated"])
 def test_store_of_an_older_version(file, tmp_path, capsys, record):
     """It opens, with NaN for a metric that was not computed then; its runs repeat; it is not gone on with."""
@@ -483,6 +490,7 @@ def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
     assert content(store) == whole
 
 
+@HERE
 @pytest.mark.parametrize("moment", [5, *(pytest.param(moment, marks=pytest.mark.full) for moment in range(10))])
 def test_disk_fills(file, sweep, tmp_path, whole, capsys, moment):
     """Whichever write fails first, what was done before is kept, and once there is space the same command goes on."""
@@ -627,6 +635,7 @@ def test_early_ctrl_c(tmp_path, moment):
     assert process.returncode == 130 and len(lines) == 1 and lines[0].startswith("mrctl: interrupted"), stderr
 
 
+@HERE
 def test_finished_jobs_are_kept(sweep, tmp_path, whole):
     """A job that is done is not computed again, nor is a sweep."""
     store = tmp_path / "store"
@@ -646,6 +655,7 @@ def tired(path, job):
     return JobOutcome(job, error=f"worker {job} is tired", fatal=True) if job == 3 else compute(path, job)
 
 
+@HERE
 def test_a_small_sweep_keeps_what_it_has_done(file, tmp_path, whole):
     """Without a `chunk` in its file, a sweep of 24 runs that ends early has kept most; it goes on to the same runs."""
     file.write_text(FILE.replace("chunk = 5\n", ""))
