@@ -517,13 +517,13 @@ def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys
 
 # --- interruptions --------------------------------------------------------------------------------
 
-LONG = FILE.replace("runs = 12", "runs = 24").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+LONG = FILE.replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
 LONG_SWEEP = pytest.mark.xdist_group("long_sweep")  # whose tests share one
 
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory):
-    """A file of a sweep of 24 jobs, and the bytes of its store."""
+    """A file of a sweep of 12 jobs, and the bytes of its store."""
     folder = tmp_path_factory.mktemp("long")
     (folder / "sweep.toml").write_text(LONG)
     jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", 1)
@@ -562,7 +562,7 @@ def test_kill(long, tmp_path, moment, hit):
     """Kill −9 at a random moment of the first half: all runs are there in the end, with the same bytes."""
     file, expected = long
     store, chance = tmp_path / "store", random.Random(f"{hit} {moment}")
-    process, enough = start(file, store), chance.randrange(13)
+    process, enough = start(file, store), chance.randrange(7)
     until(lambda: (store / "parts").exists() and len(Store(store).done()) >= enough)
     time.sleep(chance.uniform(0, 0.1))
     done = len(Store(store).done())
@@ -579,7 +579,7 @@ def test_kill(long, tmp_path, moment, hit):
         _, stderr = process.communicate(timeout=120)
         assert process.returncode == 0 and "Traceback" not in stderr, stderr
     assert content(store) == expected
-    print(f"killed the {hit} after {done} of 24 jobs")
+    print(f"killed the {hit} after {done} of 12 jobs")
 
 
 def test_fork_server_killed(file, tmp_path, whole):
@@ -612,8 +612,8 @@ def test_ctrl_c(long, tmp_path):
     assert process.returncode == 130 and "Traceback" not in stderr
     done = len(Store(store).done())
     last = stderr.strip().splitlines()[-1]
-    assert last == f"mrctl: interrupted: {2 * done} of 48 runs are done; the same command goes on", stderr
-    assert mrctl.open(store).sizes["run"] == 2 * done < 48
+    assert last == f"mrctl: interrupted: {2 * done} of 24 runs are done; the same command goes on", stderr
+    assert mrctl.open(store).sizes["run"] == 2 * done < 24
     kept = content(store)
     jobs.run(Sweep.from_toml(file), store, 1)
     assert content(store) == expected
