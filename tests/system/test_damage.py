@@ -39,7 +39,7 @@ class Half:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(here_throughout: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two jobs with all signals, one with the user's controller, and a result."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "own.py").write_text(OWN)

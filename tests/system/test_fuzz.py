@@ -112,7 +112,7 @@ def attempt(call: Callable[[], object]) -> None:
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kept(here_throughout: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kept")
     jobs.run(Sweep.from_dict(SWEEP), folder / "store", 1)
     mrctl.save(mrctl.simulate([Scenario.from_dict(BASE)]), folder / "result.zarr")

@@ -111,6 +111,7 @@ def test_kept_with_the_result(tmp_path):
     assert qpos.shape == (recording.model.nq,) and np.isfinite(qpos).all()
 
 
+@pytest.mark.usefixtures("here")
 def test_sweep(tmp_path):
     """A sweep over robots, with the digest of each."""
     pairs = [

@@ -515,6 +515,7 @@ def test_sweep(tmp_path):
     assert all(text == "motion Late: KeyError: 'late' (mine.py, line 7), tick 60" for text in failure)
 
 
+@pytest.mark.usefixtures("here")
 def test_refused_run_has_the_name_of_its_stage(tmp_path):
     """In a sweep's table, a run that could not begin counts against the controller that refused it."""
     file = tmp_path / "mine.py"
@@ -531,7 +532,7 @@ def test_refused_run_has_the_name_of_its_stage(tmp_path):
     assert set(found.feedforward.values) == set(found.label.values) == {"Pairs(gain=2)"}
 
 
-def test_sweep_of_controllers(tmp_path, capsys, monkeypatch):
+def test_sweep_of_controllers(here, tmp_path, capsys, monkeypatch):
     """A sweep drives each run with its controller; it goes on with the same bytes, and with no other controller."""
     file = tmp_path / "mine.py"
     file.write_text(
@@ -594,6 +595,7 @@ def test_sweep_of_controllers(tmp_path, capsys, monkeypatch):
     assert main(["run", "store", "--run", "3"]) == 2 and main(["run", "store", "--run", "1"]) == 0
 
 
+@pytest.mark.usefixtures("here")
 def test_company(tmp_path):
     """In a sweep, a stage that raises for one run costs no other run of its job."""
     file = tmp_path / "mine.py"
