@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,21 +32,22 @@ KINDS = "doorway", "slalom", "corridor", "cellular", "warehouse"
 LOCALISED = "scan", "particles", "none"
 # The motion stages of missions, as a file that a sweep names.
 STAGES = "\n".join(["from mrctl.navigation.mission import avoiding", *(f"{a} = avoiding('{a}')" for a in AVOIDERS)])
-# Runs each sweep in a process of its own, which is killed half-way.
+# Computes each sweep in a process of its own, which is killed half-way.
 KILLED = """
 import json
 import os
 import sys
 from pathlib import Path
 
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = sys.argv[1:3]
 import test_navigation_bits
+from conftest import Here
 from mrctl import Sweep
 from mrctl.sweep import jobs
 
-for name in sys.argv[2:]:
+jobs.Processes = Here
+for name in sys.argv[3:]:
     if not (child := os.fork()):
-        os.environ["VICTIM"] = str(os.getpid())
         sweep = Sweep.from_dict(json.loads(Path(name + ".json").read_text()))
         jobs.run(sweep, name, 1, work=test_navigation_bits.killing)
         os._exit(0)
@@ -57,10 +57,9 @@ for name in sys.argv[2:]:
 
 
 def killing(path: str, job: int) -> JobOutcome:
-    """Kills the process of the sweep in the middle."""
+    """Kills the process of the sweep, which is the one that computes, in the middle."""
     if job == Store(path).jobs // 2:
-        os.kill(int(os.environ["VICTIM"]), signal.SIGKILL)
-        time.sleep(60)  # nobody works on for a dead sweep
+        os.kill(os.getpid(), signal.SIGKILL)
     return jobs.compute(path, job)
 
 
@@ -95,7 +94,7 @@ def mission(number: int, avoid: str) -> Scenario:
     [([1], AVOIDERS[:2], 1), pytest.param(range(160), AVOIDERS, 30, marks=pytest.mark.full)],
     ids=["6", "500"],
 )
-def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, tmp_path: Path) -> None:
+def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, here: None, tmp_path: Path) -> None:
     """So with and without the stages that avoid obstacles, in worlds of all generators, with either localisation."""
     (tmp_path / "stages.py").write_text(STAGES)
     sweeps = {"none": Sweep.of([run for k in plain for run in pair(k, "none")], record="full", chunk=1)}
@@ -104,13 +103,14 @@ def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, 
         sweeps[avoid] = Sweep.of(runs, record="full", chunk=1, controller=f"motion={tmp_path}/stages.py:{avoid}")
     for name, sweep in sweeps.items():
         (tmp_path / f"{name}.json").write_text(sweep.model_dump_json())
-    command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), *(str(tmp_path / name) for name in sweeps)]
+    folders = Path(__file__).parent, Path(__file__).parents[1]
+    command = [sys.executable, "-c", KILLED, *map(str, folders), *(str(tmp_path / name) for name in sweeps)]
     subprocess.run(command, check=True)
     count, shared, outcomes = 0, set(), []
     for name, sweep in sweeps.items():
         store = tmp_path / name
         assert len(Store(store).done()) == Store(store).jobs // 2 > 0
-        jobs.run(sweep, store, 2)
+        jobs.run(sweep, store, 1)
         opened = mrctl.open(store)
         stages = user_files.load(sweep.controller) if sweep.controller else {}
         for first in range(0, sweep.size, TOGETHER):

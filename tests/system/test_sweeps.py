@@ -134,7 +134,7 @@ def test_open(sweep, finished):
     runs, lost = [run for run in range(24) if run not in failures(sweep)], failures(sweep)
     assert 0 < len(lost) < 12 and list(table["run"]) == list(range(24))
     direct = simulate([sweep.scenario(run) for run in runs]).assign_coords(run=runs)
-    opened = mrctl.open(finished)
+    opened = mrctl.open(finished).load()
     for name in SIGNALS:
         assert opened[name].dims == ("run", "time") and opened[name].attrs["units"] == SIGNALS[name][0]
         np.testing.assert_array_equal(opened[name].sel(run=runs), direct[name][:, ::10])
