@@ -1,6 +1,7 @@
 """The arrows of the architecture: who may import whom, and who may touch the physics engine."""
 
 import ast
+import json
 import os
 import signal
 import subprocess
@@ -353,14 +354,37 @@ def test_first_line_before_imports(tmp_path: Path) -> None:
     assert out.stdout == repr([said, []]), out
 
 
-INTERRUPTED = """
-import contextlib, signal, sys
+IMPORTED = (
+    "mrctl.cli", "pydantic", "tyro", "numpy", "mrctl.scenario", "xarray", "numba", "mujoco", "mrctl.loop.simulation",
+)  # fmt: skip
+TREATMENTS = "nullcontext()", "suppress(KeyboardInterrupt)"
+# A program that forks where it imports one of the modules. The fork goes on as the program, and is interrupted there.
+INTERRUPTED = f"""
+import contextlib, json, os, signal, sys
+
+program, left, ends = os.getpid(), {[*IMPORTED]!r}, []
 
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
-        if name == {name!r}:
-            with contextlib.{treatment}:
-                signal.raise_signal(signal.SIGINT)
+        if name not in left or os.getpid() != program:
+            return
+        left.remove(name)
+        for treatment in {TREATMENTS!r}:
+            reader, writer = os.pipe()
+            if not (fork := os.fork()):
+                os.close(reader)
+                os.dup2(writer, 2)
+                os.close(writer)
+                with eval("contextlib." + treatment):
+                    signal.raise_signal(signal.SIGINT)
+                return
+            os.close(writer)
+            with open(reader) as errors:
+                said = errors.read()
+            ends.append((name, treatment, os.waitstatus_to_exitcode(os.waitpid(fork, 0)[1]), said))
+        if not left:
+            print(json.dumps(ends), flush=True)
+            os._exit(0)
 
 sys.meta_path.insert(0, Interrupt())
 from mrctl.__main__ import main
@@ -369,16 +393,21 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("treatment", ["nullcontext()", "suppress(KeyboardInterrupt)"])
-@pytest.mark.parametrize(
-    "name",
-    ["mrctl.cli", "pydantic", "tyro", "numpy", "mrctl.scenario", "xarray", "numba", "mujoco", "mrctl.loop.simulation"],
-)  # fmt: skip
-def test_interrupt_while_importing(name: str, treatment: str) -> None:
+@pytest.fixture(scope="module")
+def interrupted() -> dict[tuple[str, str], tuple[int, str]]:
+    """Exit status and stderr of a command that was interrupted, by the module that it imported and the treatment."""
+    out = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False)
+    assert out.returncode == 0, out
+    ends = json.loads(out.stdout.splitlines()[-1])  # after what forks say that nothing interrupts
+    return {(name, treatment): (status, said) for name, treatment, status, said in ends}
+
+
+@pytest.mark.xdist_group("interrupted")  # whose outcomes are computed once
+@pytest.mark.parametrize("treatment", TREATMENTS)
+@pytest.mark.parametrize("name", IMPORTED)
+def test_interrupt_while_importing(name: str, treatment: str, interrupted: dict) -> None:
     """Ctrl-C ends a command with one line, whatever it is importing, also where a library drops the exception."""
-    code = INTERRUPTED.format(name=name, treatment=treatment)
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (out.returncode, out.stderr) == (130, "mrctl: interrupted\n"), out
+    assert interrupted[name, treatment] == (130, "mrctl: interrupted\n")
 
 
 @pytest.mark.parametrize("wait", [0.05, 0.2, 0.5, 1.0, 2.0])
