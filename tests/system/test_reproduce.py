@@ -11,6 +11,7 @@ from matplotlib.image import imread
 from mrctl import cli
 from mrctl.experiments import kanayama, paper
 from mrctl.loop.simulation import simulate
+from mrctl.scenario import Scenario
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what its tests share is made once
 
@@ -35,11 +36,20 @@ PINNED = {  # plant, lap in s and feedforward: V in mm/s, θ̇ in mrad/s and pos
 }
 
 
+def asked(run: Scenario) -> bool:
+    """Whether a test asks for a run: in the other steering arrangements none does for the models."""
+    return run.steering not in ("caster", "rigid") or run.feedforward in ("none", "fel")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("reproduction")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "PAPER", ("none", "model", "true_model", "fel"))  # those that the tests below ask for
+        all_runs, fixed = paper.benchmark, paper.best_fixed
+        patch.setattr(paper, "benchmark", lambda: [run for run in all_runs() if asked(run)])
+        # of which the tests ask that it is in the table, with its ratio to PID
+        patch.setattr(paper, "best_fixed", lambda runs: fixed([run.replace(laps=1) for run in runs]))
         patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
         tier_runs = paper.real
         patch.setattr(paper, "real", lambda tier: [(name, run.replace(laps=2)) for name, run in tier_runs(tier)])
