@@ -36,6 +36,14 @@ def dask(*arguments):
     return subprocess.Popen(command, start_new_session=True, env=environment, **silent)
 
 
+def address_in(file):
+    """The address of a scheduler in its file, or nothing while it is being written."""
+    try:
+        return json.loads(file.read_text())["address"]
+    except (OSError, json.JSONDecodeError):
+        return ""
+
+
 @contextlib.contextmanager
 def started(tmp_path_factory, count):
     """Address of a scheduler, the processes (nannies) that keep its workers alive, and its own."""
@@ -43,10 +51,10 @@ def started(tmp_path_factory, count):
     nannies = []
     scheduler = dask("scheduler", "--port", "0", "--scheduler-file", str(file))
     try:
-        until(lambda: file.exists() and file.read_text())  # it is empty for a moment
+        until(lambda: address_in(file))
         where = ("--scheduler-file", str(file), "--nthreads", "1", "--local-directory", str(file.parent))
         nannies += [dask("worker", *where) for _ in range(count)]
-        yield json.loads(file.read_text())["address"], nannies, scheduler
+        yield address_in(file), nannies, scheduler
     finally:
         for process in (*nannies, scheduler):
             with contextlib.suppress(ProcessLookupError):
@@ -57,8 +65,8 @@ def started(tmp_path_factory, count):
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """A scheduler and two workers."""
-    with started(tmp_path_factory, 2) as (address, nannies, _):
-        yield address, nannies
+    with started(tmp_path_factory, 2) as found:
+        yield found
 
 
 def sent(file, store, address):
@@ -78,7 +86,7 @@ def worker_of(nanny):
 
 def test_killed_worker(cluster, tmp_path):
     """The scheduler gives the job to the other worker; the store is the one that local processes make."""
-    address, nannies = cluster
+    address, nannies, _ = cluster
     assert address.startswith("tcp://127.0.0.1:")
     file, store = tmp_path / "sweep.toml", tmp_path / "store"
     file.write_text(LONG)
@@ -97,7 +105,7 @@ def test_killed_worker(cluster, tmp_path):
 
 def test_interrupted_on_a_cluster_resumed_at_home(cluster, tmp_path):
     """Ctrl-C keeps what was done, leaves the cluster alone, and the sweep goes on anywhere."""
-    address, _ = cluster
+    address, *_ = cluster
     file, store = tmp_path / "sweep.toml", tmp_path / "store"
     file.write_text(LONG)
     process = sent(file, store, address)
@@ -115,26 +123,11 @@ def test_interrupted_on_a_cluster_resumed_at_home(cluster, tmp_path):
 
 def test_poison(cluster, tmp_path):
     """A job that kills every worker that takes it is set aside; the others finish."""
-    address, _ = cluster
+    address, *_ = cluster
     sweep = Sweep.from_dict(tomllib.loads(FILE))
     report = jobs.run(sweep, tmp_path / "store", scheduler=address, work=poisoned)
     assert report.aside == {range(5, 10): "its worker died repeatedly"}
     assert report.failed == len({*failures(sweep), *range(5, 10)})
-
-
-def test_lost_scheduler(tmp_path_factory, tmp_path):
-    """One line, what was done is kept, and the sweep goes on without."""
-    with started(tmp_path_factory, 1) as (address, _, scheduler):
-        file, store = tmp_path / "sweep.toml", tmp_path / "store"
-        file.write_text(LONG)
-        process = sent(file, store, address)
-        until(lambda: len(list(store.glob("parts/*.parquet"))) > 3)
-        os.killpg(scheduler.pid, signal.SIGKILL)
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 2 and "Traceback" not in stderr, stderr
-    assert "scheduler: tcp://127.0.0.1" in stderr and "what was done is kept" in stderr.splitlines()[-1]
-    assert 4 <= len(Store(store).done()) < 12
-    assert jobs.run(Sweep.from_toml(file), store, 1).runs == 24 and Store(store).complete
 
 
 def test_suite_of_missions(cluster, tmp_path, monkeypatch):
@@ -181,3 +174,18 @@ def test_no_scheduler(tmp_path, capsys, monkeypatch):
         suite = "navigate", "--suite", "--quick", "--out", tmp_path / "suite"
         assert address in refused(capsys, *suite, "--scheduler", address) and not (tmp_path / "suite").exists()
     assert cli.main(["sweep", str(file), "--out", str(tmp_path / "store"), "--workers", "1"]) == 0
+
+
+def test_lost_scheduler(cluster, tmp_path):
+    """One line, what was done is kept, and the sweep goes on without; no test after this one has the cluster."""
+    address, _, scheduler = cluster
+    file, store = tmp_path / "sweep.toml", tmp_path / "store"
+    file.write_text(LONG)
+    process = sent(file, store, address)
+    until(lambda: len(list(store.glob("parts/*.parquet"))) > 3)
+    os.killpg(scheduler.pid, signal.SIGKILL)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 2 and "Traceback" not in stderr, stderr
+    assert "scheduler: tcp://127.0.0.1" in stderr and "what was done is kept" in stderr.splitlines()[-1]
+    assert 4 <= len(Store(store).done()) < 12
+    assert jobs.run(Sweep.from_toml(file), store, 1).runs == 24 and Store(store).complete
