@@ -135,6 +135,7 @@ def test_suite_of_missions(cluster, tmp_path, monkeypatch):
     for part in (mission_suite, learned_limits):
         monkeypatch.setattr(part, "DRAWS", {"quick": 1})
     monkeypatch.setattr(mission_suite, "SPEEDS", (0.6, 0.9))
+    monkeypatch.setattr(mission_suite, "CONTROLLERS", ("none", "model"))
     monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
     monkeypatch.setattr(three_mppis, "WORLDS", {"quick": 1})
     monkeypatch.setattr(three_mppis, "PLANTS", {"nominal": three_mppis.PLANTS["nominal"]})
