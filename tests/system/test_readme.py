@@ -44,6 +44,7 @@ ELSEWHERE = {
     r"pytest --mrctl-robot .*": ("tests/system/test_check.py::test_plugin", ""),
     r"dask .*": ("tests/system/test_sweep_dask.py::test_killed_worker", ""),
     r"python -m mrctl\.experiments\.results_page .*": ("tests/unit/test_results_page.py::test_sections", ""),
+    r"mrctl check( turtlebot| racecar --json)?": ("tests/system/test_check.py::test_good", "mrctl.checks.command.run"),
     r"mrctl sweep .* --scheduler .*": ("tests/system/test_sweep_dask.py::test_killed_worker", "mrctl.sweep.jobs.run"),
     r"mrctl reproduce": ("tests/system/test_reproduce.py::test_network_beats_pid", "mrctl.experiments.paper.reproduce"),
     r"mrctl suite( --\w+( \d+)?)*": ("tests/system/test_suite.py::test_table", "mrctl.experiments.suite.suite"),
