@@ -204,17 +204,17 @@ def test_saved_results_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
 
 def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """By the IMC rule the ratio of the learning condition is 1 + τ/λ, with the robot's own time constant."""
-    by_rule = ["tune", "--time-constant", "0.15", "--delay", "0", "0.03", "--out", str(tmp_path), "--json"]
+    by_rule = ["tune", "--time-constant", "0.15", "--delay", "0", "0.02", "0.04", "--out", str(tmp_path), "--json"]
     assert cli.main(by_rule) == 0
     printed, said = capsys.readouterr()
     assert said.splitlines()[-1] == f"The files are in {tmp_path}."
     table = json.loads(printed)
     assert json.loads((tmp_path / "table.json").read_text()) == table
     assert (tmp_path / "sensitivity.png").stat().st_size > 5000
-    assert [row["delay"] for row in table["loops"]] == 4 * [0, 0.03]
+    assert [row["delay"] for row in table["loops"]] == 4 * [0, 0.02, 0.04]
     assert table["time_constant"] == 0.15
     assert table["loops"][0]["ratio"] == pytest.approx(1 + 0.234 / 0.15, rel=5e-3)
-    assert [row["k_p"] for row in table["loops"][-2:]] == [0.3, 0.3]
+    assert [row["k_p"] for row in table["loops"][-3:]] == [0.3, 0.3, 0.3]
 
 
 def test_tune_designs(capsys: pytest.CaptureFixture) -> None:

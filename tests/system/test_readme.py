@@ -58,6 +58,12 @@ ELSEWHERE = {
     r"mrctl identify racecar .*": (
         "tests/system/test_identification.py::test_racing_car", "mrctl.experiments.identify.run",
     ),
+    r"mrctl tune --time-constant .*": (
+        "tests/system/test_commands.py::test_tune_states_the_learning_condition", "mrctl.experiments.tuning.tune",
+    ),
+    r"mrctl tune racecar .*": (
+        "tests/system/test_commands.py::test_tune_designs", "mrctl.experiments.tuning.tune",
+    ),
     r"mrctl tune --search .*": ("tests/system/test_search.py::test_command", "mrctl.experiments.search.search"),
     r"mrctl bench": ("tests/benchmarks/test_bench.py::test_command", "mrctl.experiments.bench.run"),
     r"mrctl view( --(?!export)\S+( \w+)*)*": (
