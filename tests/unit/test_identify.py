@@ -106,6 +106,19 @@ def test_exact(robot):
         assert constants(robot, *pair) == pytest.approx(truths(robot), rel=2e-3)
 
 
+@pytest.fixture(scope="module")
+def unchanged(robot):
+    """The constants of the robot as it is, from the draws of `test_tells_apart`."""
+    return from_draws(robot, robot)
+
+
+def from_draws(driven, robot):
+    """The constants of a robot that is driven, identified as those of another one."""
+    random = np.random.default_rng(2)
+    return constants(robot, drives(driven, 1, random, False)[0], drives(driven, 1, random, True)[0])
+
+
+@pytest.mark.xdist_group("tells_apart")  # whose unchanged robot is driven once
 @pytest.mark.parametrize(
     ("field", "factor", "moves"),
     [
@@ -117,14 +130,10 @@ def test_exact(robot):
         ("com_offset", 0.5, {"m c", "J_e"}),
     ],
 )
-def test_tells_apart(robot, field, factor, moves):
+def test_tells_apart(robot, unchanged, field, factor, moves):
     """A change of the robot shows in the constants that hold it and in no other."""
-    changed = robot.model_copy(update={field: factor * getattr(robot, field)})
-    rows = []
-    for one in (robot, changed):
-        random = np.random.default_rng(2)
-        rows.append(constants(robot, drives(one, 1, random, False)[0], drives(one, 1, random, True)[0]))
-    assert {name for name in rows[0] if rows[1][name] != pytest.approx(rows[0][name], rel=0.01)} == moves
+    changed = from_draws(robot.model_copy(update={field: factor * getattr(robot, field)}), robot)
+    assert {name for name in unchanged if changed[name] != pytest.approx(unchanged[name], rel=0.01)} == moves
 
 
 def test_intervals_cover(robot):
