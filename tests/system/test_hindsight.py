@@ -22,7 +22,7 @@ from mrctl import (
     simulate,
 )
 from mrctl.control.features import feature_matrix
-from mrctl.loop.hindsight import best_fixed, drive
+from mrctl.loop.hindsight import REPETITIONS, best_fixed, drive
 from mrctl.loop.simulation import Simulation
 from mrctl.results.metrics import over_laps
 from mrctl.sweep import jobs
@@ -78,7 +78,7 @@ def test_fit(steering):
             assert (fitted.position_rmse.values < 1.1 * other.position_rmse.values).all()
 
 
-def test_best_of_its_drives():
+def test_best_of_its_drives(monkeypatch):
     """Of the model and what is fitted each run has the better one; runs of two kinds keep their order.
 
     With 20 ms more delay than the controller knows the loop oscillates with the fitted coefficients.
@@ -88,7 +88,12 @@ def test_best_of_its_drives():
     runs = [
         s.replace(**FEEDFORWARDS["model"], perturbation=p) for s, p in zip(replicates(plain, 3), plants, strict=True)
     ]
-    drives = best_fixed(runs), simulate(runs), twice_fitted(runs)
+    made = []
+    with monkeypatch.context() as patch:
+        patch.setattr("mrctl.loop.hindsight.drive", lambda *given: made.append(drive(*given)) or made[-1])
+        chosen = best_fixed(runs)
+    assert len(made) == 1 + REPETITIONS == 3
+    drives = chosen, simulate(runs), made[-1][0]
     best, model, fitted = (over_laps(per_lap(one), "position_rmse").values for one in drives)
     assert (model < 0.8 * fitted).tolist() == [True, True, False]
     assert (fitted < model).tolist() == [False, False, True]
