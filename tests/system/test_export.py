@@ -44,6 +44,14 @@ def path(result, tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def alone(result, tmp_path_factory) -> Path:
+    """The first run, as a result of one scenario, which has no dimension for runs."""
+    path = tmp_path_factory.mktemp("alone") / "alone.zarr"
+    save(result.isel(run=0), path)
+    return path
+
+
 def messages(file: Path):
     """Topic to type, times in ns and messages, decoded by the definitions of ROS and not by those in the file."""
     found = {}
@@ -263,17 +271,15 @@ def test_npz(result, path, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["mcap", "csv", "parquet", "npz"])
-def test_run_alone(result, tmp_path, kind):
-    """A result of one scenario, which has no dimension for runs."""
-    save(result.isel(run=0), tmp_path / "alone.zarr")
+def test_run_alone(result, path, alone, tmp_path, kind):
+    """A result of one scenario gives what the run gives from a result of several."""
     out, other = tmp_path / f"alone.{kind}", tmp_path / f"first.{kind}"
-    assert export(mrctl.open(tmp_path / "alone.zarr"), kind, out) == 1
+    assert export(mrctl.open(alone), kind, out) == 1
     if kind == "npz":
         with np.load(out) as arrays:
             assert np.array_equal(arrays["v"], result["v"].values[:1]) and arrays["label"].tolist() == ["none"]
     else:
-        save(result, tmp_path / "both.zarr")
-        export(mrctl.open(tmp_path / "both.zarr"), kind, other, 0)
+        export(mrctl.open(path), kind, other, 0)
         assert out.read_bytes() == other.read_bytes()
 
 
