@@ -24,7 +24,8 @@ pytestmark = pytest.mark.xdist_group("bench")  # what its tests share is made on
 @pytest.fixture(scope="module")
 def figures():
     """Everything, in a form of a few seconds."""
-    return bench.run(sizes=(1, 3), repetitions=2, chunk=30, worlds=5)
+    with mock.patch.object(bench_navigation, "MAX_TURNS", 1):
+        return bench.run(sizes=(1, 3), repetitions=2, chunk=30, worlds=5)
 
 
 @pytest.mark.parametrize(("size", "threads"), [(1, 1), (3, 1), (17, 2)])
