@@ -75,6 +75,10 @@ def nominal(tier, runs):
 MANY = [pytest.param(tier, 100, marks=pytest.mark.full) for tier in TIERS]
 
 
+NOMINAL = pytest.mark.xdist_group("nominal")  # whose tests share what is driven
+
+
+@NOMINAL
 @pytest.mark.parametrize(("tier", "runs"), [("lab", 24), ("field", 24), *MANY])
 def test_consistent(tier, runs):
     """The errors of nominal robots are as large as the filter says; `pytest -m full` takes 100 runs.
@@ -115,6 +119,7 @@ def test_consistent(tier, runs):
     assert np.nansum(innovations) / number.sum() == pytest.approx(1, abs=4 * np.sqrt(2 / number.sum()) + 0.01)
 
 
+@NOMINAL
 @pytest.mark.parametrize("tier", TIERS)
 def test_start(tier):
     """V is as wrong as the filter says from the first tick on, though the motors brake until a voltage comes."""
