@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from importlib import resources
 from pathlib import Path
 
 from mrctl.physics.bounds import check_bounds
-from mrctl.record import InputError
+from mrctl.record import InputError, reading
 from mrctl.theory.robot import RobotFile
 
 SHIPPED = ("car", "turtlebot", "racecar")
@@ -22,6 +23,20 @@ def models_folder() -> Path:
 def find(name: str) -> Path:
     """Returns the path of a shipped file by its name, or `name` itself where it ends in `.xml`; it need not exist."""
     return Path(name) if name.endswith(".xml") else models_folder() / f"{name}.xml"
+
+
+def is_shipped(name: str) -> bool:
+    """Tells whether a name stands for a file in the folder of the shipped ones; it need not exist."""
+    return find(name).parent == models_folder()
+
+
+def shipped_digest() -> str:
+    """Returns a digest of the paths and contents of all shipped files, which include no others."""
+    found = hashlib.sha256()
+    for path in sorted(models_folder().glob("*.*")):
+        with reading(path):
+            found.update(bytes(path) + path.read_bytes())
+    return found.hexdigest()
 
 
 def _not_there(name: str, path: Path) -> str:

@@ -1,17 +1,20 @@
 """Compiled worlds: robot and steering in each of them, digests, and files that are refused."""
 
+import os
 import shutil
+from functools import partial
 
 import mujoco
 import numpy as np
 import pytest
 
 from mrctl import Circle, Scenario, per_lap, simulate
-from mrctl.physics import mjcf
-from mrctl.physics.files import models_folder
+from mrctl.physics import files, mjcf
+from mrctl.physics.files import SHIPPED, models_folder
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.robot import RobotFile
 
 NOMINAL = mjcf.load()
 BASE = read_robot(NOMINAL)
@@ -109,6 +112,57 @@ def test_timestep_of_any_contact(own, friction):
 def folder(tmp_path):
     """Returns a copy of the shipped models, which a test may break."""
     return shutil.copytree(models_folder(), tmp_path / "models")
+
+
+@pytest.mark.parametrize("robot", SHIPPED)
+def test_compiled_once(folder, monkeypatch, robot):
+    """A shipped model is compiled once, and a caller who changes it changes no other; other files are, each time."""
+    robot, assembled = RobotFile(path=robot), []
+    elsewhere = shutil.copytree(folder, folder.with_name("others"))  # as long a name: the size of a model depends on it
+    monkeypatch.setattr(files, "models_folder", lambda: folder)
+    monkeypatch.setattr(mjcf, "_assembled", lambda *p, of=mjcf._assembled: assembled.append(p) or of(*p))
+    build = partial(mjcf.build, steering=mjcf.arrangement(robot), timestep=1e-3, robot=robot)
+    assembled.clear()
+    model, nominal = build("rough")
+    digest = mjcf.digest(model)
+    model.body_mass *= 2
+    model.numeric("limits").data[:] = 0
+    again, same = build("rough")
+    assert mjcf.digest(again) == digest != mjcf.digest(model) and same == nominal == read_robot(again)
+    assert mjcf.load("rough", robot=robot).opt.timestep == 0.002
+    assert len(assembled) <= 2  # with the steering by its name, and as the default
+    assembled.clear()
+    for world in ("rough", "rough.xml"):
+        assert all(mjcf.digest(build(str(elsewhere / world))[0]) == digest for _ in range(2))
+    assert len(assembled) == 4
+
+
+@pytest.mark.parametrize("shipped", [True, False])
+def test_changed_file(folder, monkeypatch, shipped):
+    """A model is that of its files as they are, even if size and times of a file stay; it warns each time."""
+    if shipped:
+        monkeypatch.setattr(files, "models_folder", lambda: folder)
+    world, robot = ("flat", "racecar") if shipped else (str(folder / "flat.xml"), str(folder / "racecar.xml"))
+
+    def change(file, old, new):
+        path = folder / file
+        text, found = path.read_text(), path.stat()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        os.utime(path, ns=(found.st_atime_ns, found.st_mtime_ns))
+
+    masses = [mjcf.build(world, robot=RobotFile(path=robot))[1].mass]
+    change("racecar.xml", 'mass="3.26"', 'mass="3.76"')
+    masses.append(mjcf.build(world, robot=RobotFile(path=robot))[1].mass)
+    assert np.diff(masses) == pytest.approx(0.5)
+    steps = [mjcf.load(world).opt.timestep]
+    change("car.xml", 'timestep="0.002"', 'timestep="0.001"')
+    steps.append(mjcf.load(world).opt.timestep)
+    assert steps == [0.002, 0.001]
+    change("car.xml", "<compiler ", '<compiler settotalmass="20" ')
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="settotalmass"):
+            mjcf.load(world)
 
 
 def broken(folder, old, new, file="car.xml"):
