@@ -328,9 +328,9 @@ def search(
     out = out or Path("search") / searched.title
     table: dict[str, Any] = {"versions": versions(), "machine": machine(), "entry": searched.title}
     table |= {"bounds": searched.bounds, "shipped": searched.shipped, "budget": budget._asdict(), "tiers": {}}
-    drawn = {tier: worlds(tier, budget) for tier in tiers}
-    heads = {tier: _head(searched, drawn[tier], budget) for tier in tiers}
     with output_folder(out):
+        drawn = {tier: worlds(tier, budget) for tier in tiers}
+        heads = {tier: _head(searched, drawn[tier], budget) for tier in tiers}
         memories = {tier: Memory(out / f"{tier}.jsonl", heads[tier], threads) for tier in tiers}
         found = {tier: find(searched, tier, memories[tier], drawn[tier].seen, budget) for tier in tiers}
     candidates = {"shipped": searched.shipped} | {tier: one["found"] for tier, one in found.items()}

@@ -13,6 +13,7 @@ from mrctl import cli
 from mrctl.experiments import cases, search
 from mrctl.experiments.search import Budget
 from mrctl.loop import user_files
+from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.sensing.tiers import TIERS
 
@@ -213,6 +214,14 @@ def test_neighbour_that_stages_share(tmp_path, monkeypatch):
     (tmp_path / "shared_by_stages.py").write_text("known = [0]\n")
     stages = user_files.load(f"{tmp_path / 'a.py'}:own,motion={tmp_path / 'b.py'}:own")
     assert stages["feedforward"](1, 1) is stages["motion"](2, 1) == [0, 1, 2]
+
+
+def test_folder_first(tmp_path, monkeypatch):
+    """A folder that cannot be written is refused before any world is drawn."""
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(search, "worlds", lambda *_: pytest.fail("drawn"))
+    with pytest.raises(InputError, match="^out: .*cannot be written"):
+        search.search("fel", ("ideal",), tmp_path / "file" / "out", True, Budget(1, 1, 4, 1))
 
 
 @pytest.mark.parametrize(
