@@ -193,7 +193,7 @@ def test_wire(server):
         with client(server) as visitor:
             visitor.send(packed(CAMERA))
             start, received = time.monotonic() + 2, 0  # the scene comes first
-            while (now := time.monotonic()) < start + 4:
+            while (now := time.monotonic()) < start + 2.5:
                 received += len(visitor.recv(timeout=30)) * (now > start)
         for chart in live._plots._handles:
             t, *_, marks = chart.data
