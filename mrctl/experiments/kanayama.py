@@ -15,7 +15,6 @@ import numpy as np
 from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.limiter import LIMITER, limit
 from mrctl.kernel import Array, Rows, kernel
-from mrctl.theory.kinematics import pose_rates
 
 STEP = 1e-4  # s
 SPEED = 0.30  # m/s
@@ -71,20 +70,50 @@ def _cases() -> list[Case]:
 CASES = _cases()
 
 
-CASE = np.dtype([("k", GAINS), ("error", "f8", 3), ("request", "f8", 2), ("limiter", LIMITER)], align=True)
+CASE = np.dtype(
+    [
+        ("pose", "f8", 3),  # m, m, rad
+        ("hold", "i8"),  # number of steps in a control period
+        ("limited", "?"),  # whether the limiter acts
+        ("k", GAINS),
+        ("error", "f8", 3),  # m, m, rad
+        ("request", "f8", 2),  # m/s, rad/s
+        ("limiter", LIMITER),
+    ],
+    align=True,
+)
 
 
 @kernel
-def control(
-    pose: Array, reference: Array, twist: Array, zero: Array, max_twist: Array, max_acceleration: Array, period: float,
-    rows: Rows,
-) -> None:  # fmt: skip
-    """Applies the motion controller, and the limiter to its request, in all cases."""
-    for i in range(len(rows)):
-        s = rows[i]
-        posture_error(pose[i], reference, s.error)
-        kanayama(s.error, twist, s.k, s.request)
-        limit(s.request, zero, zero, max_twist, max_acceleration, period, s.limiter)
+def drive(
+    reference: Array, twist: Array, zero: Array, max_twist: Array, max_acceleration: Array, rows: Rows, record: Array
+) -> None:
+    """Drives all cases.
+
+    Args:
+        reference: Reference posture at the start in m, m, rad, `(3,)`; it is moved.
+        twist: Reference twist in m/s and rad/s, `(2,)`, without rotation.
+        zero: Two zeros.
+        max_twist: Limits on v and ω in m/s and rad/s, `(2,)`.
+        max_acceleration: Limits on v̇ and ω̇ in m/s² and rad/s², `(2,)`.
+        rows: The B cases, records of `CASE`.
+        record: Out: postures `(steps, B, 3)` in m, m, rad, before each step.
+    """
+    for k in range(len(record)):
+        reference[0] = SPEED * STEP * k
+        for i in range(len(rows)):
+            s = rows[i]
+            for axis in range(3):
+                record[k, i, axis] = s.pose[axis]
+            if k % s.hold == 0:
+                posture_error(s.pose, reference, s.error)
+                kanayama(s.error, twist, s.k, s.request)
+                limit(s.request, zero, zero, max_twist, max_acceleration, s.limiter.time_constant, s.limiter)
+            v, omega = s.limiter.command if s.limited else s.request
+            middle = s.pose[2] + STEP / 2 * omega
+            s.pose[0] += STEP * (v * np.cos(middle))
+            s.pose[1] += STEP * (v * np.sin(middle))
+            s.pose[2] += STEP * omega
 
 
 def paths(cases: list[Case], period: float = STEP) -> Array:
@@ -97,24 +126,13 @@ def paths(cases: list[Case], period: float = STEP) -> Array:
     Returns:
         Postures `(steps, B, 3)` in m, m, rad, `STEP` apart in time.
     """
-    size, hold = len(cases), round(period / STEP)
-    pose = np.array([[0.0, case.offset, case.turn] for case in cases])
-    rows = np.zeros(size, CASE)
+    rows = np.zeros(len(cases), CASE)
     for row, case in zip(rows, cases, strict=True):
-        row["k"] = K_X, K_Y, case.k_theta
-    limited = np.array([[case.limited] for case in cases])
+        row["pose"], row["limited"], row["k"] = (0.0, case.offset, case.turn), case.limited, (K_X, K_Y, case.k_theta)
+    rows["hold"] = round(period / STEP)
     rows["limiter"]["time_constant"], rows["limiter"]["command"] = period, (SPEED, 0.0)
-    twist = np.zeros((size, 2))
-    steps = round(DURATION / STEP)
-    record = np.empty((steps, size, 3))
-    for k in range(steps):
-        record[k] = pose
-        if k % hold == 0:
-            reference = np.array([SPEED * STEP * k, 0.0, 0.0])
-            control(pose, reference, np.array([SPEED, 0.0]), np.zeros(2), LIMITS[:2], LIMITS[2:], period, rows)
-            twist = np.where(limited, rows["limiter"]["command"], rows["request"])
-        middle = pose + STEP / 2 * pose_rates(pose, twist)
-        pose = pose + STEP * pose_rates(middle, twist)
+    record = np.empty((round(DURATION / STEP), len(cases), 3))
+    drive(np.zeros(3), np.array([SPEED, 0.0]), np.zeros(2), LIMITS[:2], LIMITS[2:], rows, record)
     return record
 
 
