@@ -1,6 +1,7 @@
 """The viewer in a real headless browser: what a visitor sees and does. Screenshots are in pytest's folders."""
 
 import io
+import json
 import re
 import shutil
 import threading
@@ -178,13 +179,16 @@ CAMERA = """() => {
 SCENE_WIDTH = "window.__viserMutable.canvas.getBoundingClientRect().width"
 
 
+CURVES = """(title) => {
+    const charts = Object.values(window.__viserTestpoints?.uplots ?? {}).map(({chart}) => chart);
+    const named = charts.filter((chart) => chart.root.querySelector('.u-title').textContent === title);
+    return JSON.stringify(named.map((chart) => chart.data.map((values) => Array.from(values))));
+}"""
+
+
 def curves(page, title):
-    """Data of a chart, as the browser draws it."""
-    charts = page.evaluate(
-        "Object.values(window.__viserTestpoints?.uplots ?? {}).map(({chart}) => "
-        "[chart.root.querySelector('.u-title').textContent, chart.data.map((d) => Array.from(d))])"
-    )
-    return [np.array(data) for name, data in charts if name == title]
+    """Data of a chart, as the browser draws it; Playwright alone would take long to return so many numbers."""
+    return [[np.array(values, float) for values in data] for data in json.loads(page.evaluate(CURVES, title))]
 
 
 def test_live(browser, tmp_path):
