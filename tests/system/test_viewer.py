@@ -796,7 +796,6 @@ def test_soft_light(browser):
             until(lambda: node(page, ROBOT) is not None, "the scene")
             time.sleep(1.0)
             assert not live.server.soft and not page.get_by_label("Soft light").is_checked()
-        with visit(browser, url, slowly=True) as page:
             page.add_init_script(ON_A_GPU)
             page.reload()
             until(lambda: live.server.soft, "soft light")
