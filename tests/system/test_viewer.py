@@ -176,6 +176,11 @@ CAMERA = """() => {
 }"""
 
 
+TAKES_DRAGS = """(names) => names.every((name) => {
+    const node = window.__viserMutable.nodeRefFromName[name];
+    return node?.children.length && node.parent.__r3f.handlers.onPointerDown;
+})"""
+PICTURES = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 SCENE_WIDTH = "window.__viserMutable.canvas.getBoundingClientRect().width"
 
 
@@ -191,6 +196,17 @@ def curves(page, title):
     return [[np.array(values, float) for values in data] for data in json.loads(page.evaluate(CURVES, title))]
 
 
+def rest(page, live):
+    """Waits until a page shows its robots where a session that pauses has them."""
+
+    def there():
+        shown = [node(page, name) for name in (ROBOT, GHOST)[: live.session.size]]
+        return np.allclose(shown, [live.session.qpos(k)[:3] for k in range(len(shown))], atol=1e-5)
+
+    until(there, "the robots where they are")
+    page.evaluate(PICTURES)
+
+
 def test_live(browser, tmp_path):
     """Two robots drive along the reference, pause holds them, a payload is dropped, seen, listed, and felt."""
     quiet = BASE.model_copy(update={"sensing": Sensing(tier="ideal")})  # errors of noise would hide that of a payload
@@ -204,7 +220,7 @@ def test_live(browser, tmp_path):
         page.get_by_text("pause", exact=True).click()
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
         page.mouse.move(640, 700)
-        time.sleep(1.0)  # the last pictures arrive
+        rest(page, live)
         held, tick = node(page, ROBOT), live.session.tick
         assert abs(np.hypot(*(held[:2] - [0, 0.8])) - 0.8) < 0.06  # on the circle that the reference is
         still = picture(page, tmp_path / "live_two_robots.png")
@@ -233,13 +249,15 @@ def test_live(browser, tmp_path):
         seen = lambda: page.evaluate(WORLD_TO_SCREEN, [0, 0.8, 0])  # noqa: E731 (the middle of the circle)
         page.get_by_text("drop payload").click()
         until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
+        live.ask(live.choose_speed, "5×")
         page.keyboard.press("Space")
         until(lambda: live.session.tick > tick + 250, "the robots to drive on")
         page.get_by_text("pause", exact=True).click()
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the second pause")
-        time.sleep(1.0)
+        rest(page, live)
         assert moved(still, picture(page, tmp_path / "live_payload.png")) > 300
-        t, _, without, marks = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
+        error = lambda: curves(page, "position error, mm")[0]  # noqa: E731
+        t, _, without, marks = until(lambda: (e := error())[0][-1] > live.session.time - 0.1 and e, "the curves")
         dropped = live.session.saved()[1].events[0].time
         assert t[marks == 1] == pytest.approx([dropped], abs=0.051)  # a sample of the curves, in float32
         post = places(page, "/world/events")[:, :2].mean(axis=0)
@@ -477,7 +495,15 @@ def test_dragging(browser, tmp_path):
         page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
         page.get_by_label("Push by dragging").click()
         until(lambda: not live.playing and live._hands._pushes.value, "the pause")
-        page.wait_for_timeout(1000)
+        rest(page, live)
+        first = live._scene.camera(False, page.evaluate("window.__viserMutable.camera.aspect"))[0]
+        until(lambda: np.allclose(page.evaluate(CAMERA), first, atol=1e-6), "the camera at its place")
+
+        def held(*names):
+            until(lambda: page.evaluate(TAKES_DRAGS, names), "the page to take drags")
+            page.evaluate(PICTURES)
+
+        held(*(part.name for part in live._scene.robots.held if "/mesh/" in part.name))
         camera, here = page.evaluate(CAMERA), live.session.qpos(0)[:2].copy()
 
         def drag(start, *places):
@@ -503,7 +529,7 @@ def test_dragging(browser, tmp_path):
 
         page.get_by_text("Set a goal", exact=True).click()
         until(lambda: "Drag on the floor" in page.inner_text("#mrctl-picking"), "the wait for a goal")
-        page.wait_for_timeout(1000)
+        held("/world/grip")
         drag(at(0.3, 1.2), at(0.3, 1.4), at(0.3, 1.6))
         page.mouse.up()
         until(lambda: len(live.session.saved()[0].events) == 2 and live._ends is not None, "the goal")
@@ -515,7 +541,7 @@ def test_dragging(browser, tmp_path):
         page.get_by_label("Contact forces").click()
         page.get_by_text("Draw a way", exact=True).click()
         until(lambda: "add a point" in page.inner_text("#mrctl-picking"), "the wait for points")
-        page.wait_for_timeout(1000)
+        held("/world/grip")
         for k, place in enumerate([at(0.8, 0.6), at(0.3, 1.2)]):
             page.mouse.click(*page.evaluate(WORLD_TO_SCREEN, place.tolist()))
             until(lambda k=k: len(live._hands._points) == k + 1, "a point")
@@ -594,7 +620,8 @@ def test_replay(browser, tmp_path):
         until(scrubbed, "the scrubber")
         expected = result.isel(run=0).sel(time=7.5, method="nearest")
         until(lambda: np.allclose(node(page, ROBOT)[:2], [expected.x, expected.y], atol=1e-3), "the robot to be there")
-        time.sleep(1.0)
+        cursors = lambda: [axes["cursor"] or np.nan for axes in page.evaluate(AXES).values()]  # noqa: E731
+        until(lambda: np.allclose(now := cursors(), 7.5, atol=0.05) and now, "a cursor in each chart")
         picture(page, tmp_path / "replay.png")
         t, *drawn = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
         assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2 + 1  # and the marks of events
@@ -810,6 +837,7 @@ def test_soft_light(browser):
 DOT = """(index) => {
     const chart = Object.values(window.__viserTestpoints.uplots).map((u) => u.chart)
         .find((c) => c.series[1].label === 'run');
+    if (!chart) return null;
     const box = chart.over.getBoundingClientRect();
     return [box.left + chart.valToPos(chart.data[0][index], 'x'), box.top + chart.valToPos(chart.data[2][index], 'y')];
 }"""
@@ -858,13 +886,13 @@ def test_sweep(browser, tmp_path):
         page.get_by_role("tab", name="All runs").click()
         scatter = replay._scatter
         assert scatter is not None
-        time.sleep(2.0)
         factors = library.table["perturbation.mass_factor"].to_numpy()
         np.testing.assert_array_equal(scatter.data[0], np.sort(factors))
         order = np.argsort(factors)
         np.testing.assert_allclose(scatter.data[2], 1e3 * library.table["position_rmse"].to_numpy()[order])
-        at = page.evaluate(DOT, order.tolist().index(4))
-        assert pixel(page, tmp_path / "sweep.png", at) == DROVE_COLOUR  # a dot is where the run is
+        dot = lambda: page.evaluate(DOT, order.tolist().index(4))  # noqa: E731
+        drawn = lambda at: at and pixel(page, tmp_path / "sweep.png", at) == DROVE_COLOUR and dot() == at  # noqa: E731
+        at = until(lambda: drawn(there := dot()) and there, "the dot, where the run is")
         page.mouse.click(at[0] + 3, at[1] - 3)
         until(lambda: replay.runs == [4], "the run to open")
         ring = at[0] + RING_SIZE / 2 - 1, at[1]
@@ -874,9 +902,8 @@ def test_sweep(browser, tmp_path):
         scatter.axes[1].value = "electrical energy, J"
         replay.ask(scatter.draw)
         until(lambda: scatter.logarithmic == [False, True], "another axis")
-        time.sleep(1.0)
-        heights = sorted(page.evaluate(DOT, k)[1] for k in range(6))
-        assert np.ptp(np.diff(heights)) < 0.1  # decades, which are equally far
+        apart = lambda: np.diff(sorted(page.evaluate(DOT, k)[1] for k in range(6)))  # noqa: E731
+        until(lambda: np.ptp(gaps := apart()) < 0.1 and gaps.min() > 1, "decades, which are equally far")
         page.screenshot(path=tmp_path / "logarithmic.png", timeout=PATIENCE)
     again = simulate(jobs.scenario_of(tmp_path / "store", 4))
     assert replay._log["x"][:, 0].tobytes() == again.x.values.tobytes()
