@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator
 import pytest
 from hypothesis import settings
 
-from mrctl.kernel import kernel_files_digest
-from mrctl.theory.robot import Robot
-
 # The workers of pytest-xdist, which inherit these, use all cores. Threads of BLAS and torch would have to wait for each
-# other there: an exponential of a 2 × 2 matrix took 3 ms instead of 0.02.
+# other there: an exponential of a 2 × 2 matrix took 3 ms instead of 0.02. NumPy is imported by the modules below.
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
+
+from mrctl.kernel import kernel_files_digest  # noqa: E402
+from mrctl.theory.robot import Robot  # noqa: E402
 
 # A shell lets what runs in its background ignore Ctrl-C, and all processes that the tests start would inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
