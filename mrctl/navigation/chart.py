@@ -2,7 +2,9 @@
 
 Some places inside each obstacle are looked at. It is gone when beams have passed through 90 % of them, through each in
 at least five scans. One scan proves little, because the pose from which it seems to be taken is estimated. An obstacle
-is back when points of a scan lie on it again. What is gone is gone as a whole: a wall with a new door stays.
+is back when points of a scan lie on it again. What is gone is gone as a whole: a wall with a new door stays. A point
+that may be of two obstacles counts for the nearer one. From far away a thing may therefore be taken for gone where the
+error of the estimate moves its points to a wall behind it, until a scan from nearby shows it.
 """
 
 from __future__ import annotations
