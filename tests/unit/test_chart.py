@@ -54,8 +54,8 @@ def test_gone_and_back(thing: str) -> None:
 def test_what_stands_stays(seed: int) -> None:
     """From many poses, with noise, lost beams and an estimate that is 4 cm and 1.5° off; also thin poles and walls.
 
-    Things are farther apart than such an estimate moves what is 9 m away, as points that lie nearer to a neighbour count
-    for that one.
+    Things are farther apart than such an estimate moves what is 9 m away, as points that lie nearer to a neighbour
+    count for that one.
     """
     random = np.random.default_rng(seed)
     drawn = [
