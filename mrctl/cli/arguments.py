@@ -31,8 +31,8 @@ POSE_FLAGS = "--goal", "--start", "--initial-pose"
 def expanded(arguments: list[str]) -> list[str]:
     """Expands short flags into full ones.
 
-    `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT_FLAGS`
-    the longer one, and a pose x,y,θ three numbers.
+    `--perturbation NAME` becomes all flags of that perturbation, so that it replaces that of a scenario file; later
+    flags override it. A flag of `SHORT_FLAGS` becomes the longer one, and a pose x,y,θ three numbers.
 
     Raises:
         InputError: There is no perturbation of that name, a short flag has no value, or a pose has not three numbers.
