@@ -329,8 +329,9 @@ def digest(model: mujoco.MjModel) -> str:
     sha256 = hashlib.sha256()
     for part in (model, model.opt, model.stat):
         for name, value in getmembers(part):
-            # Skips private attributes, and file paths with their lengths and addresses: equal models differ in them.
-            if name.startswith("_") or name in ("paths", "npaths") or name.endswith("pathadr"):
+            # Skips private attributes, and paths of files with their lengths, addresses and place in the buffer: equal
+            # models differ in them.
+            if name.startswith("_") or name in ("paths", "npaths", "nbuffer") or name.endswith("pathadr"):
                 continue
             if isinstance(value, (np.ndarray, int, float, bytes)):
                 array = np.asarray(value)

@@ -66,6 +66,8 @@ def test_digest(tmp_path):
         found.append(mjcf.digest(mjcf.load(str(world))))
     assert len(set(found)) == 5
     assert mjcf.digest(mjcf.load(str(tmp_path / "rough.xml"))) == found[0]
+    far = shutil.copytree(tmp_path, tmp_path / ("far" * 50))  # which the model's buffer has to hold
+    assert mjcf.digest(mjcf.load(str(far / "rough.xml"))) == found[0]
 
 
 @pytest.mark.parametrize("step", [0.002, 0.001, 0.0005, 0.00025])
@@ -118,7 +120,7 @@ def folder(tmp_path):
 def test_compiled_once(folder, monkeypatch, robot):
     """A shipped model is compiled once, and a caller who changes it changes no other; other files are, each time."""
     robot, assembled = RobotFile(path=robot), []
-    elsewhere = shutil.copytree(folder, folder.with_name("others"))  # as long a name: the size of a model depends on it
+    elsewhere = shutil.copytree(folder, folder.with_name("elsewhere"))
     monkeypatch.setattr(files, "models_folder", lambda: folder)
     monkeypatch.setattr(mjcf, "_assembled", lambda *p, of=mjcf._assembled: assembled.append(p) or of(*p))
     build = partial(mjcf.build, steering=mjcf.arrangement(robot), timestep=1e-3, robot=robot)
