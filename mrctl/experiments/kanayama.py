@@ -73,7 +73,8 @@ CASES = _cases()
 CASE = np.dtype(
     [
         ("pose", "f8", 3),  # m, m, rad
-        ("hold", "i8"),  # number of steps in a control period
+        ("period", "f8"),  # control period, s
+        ("hold", "i8"),  # number of steps in it
         ("limited", "?"),  # whether the limiter acts
         ("k", GAINS),
         ("error", "f8", 3),  # m, m, rad
@@ -108,7 +109,7 @@ def drive(
             if k % s.hold == 0:
                 posture_error(s.pose, reference, s.error)
                 kanayama(s.error, twist, s.k, s.request)
-                limit(s.request, zero, zero, max_twist, max_acceleration, s.limiter.time_constant, s.limiter)
+                limit(s.request, zero, zero, max_twist, max_acceleration, s.period, s.limiter)
             v, omega = s.limiter.command if s.limited else s.request
             middle = s.pose[2] + STEP / 2 * omega
             s.pose[0] += STEP * (v * np.cos(middle))
@@ -129,7 +130,7 @@ def paths(cases: list[Case], period: float = STEP) -> Array:
     rows = np.zeros(len(cases), CASE)
     for row, case in zip(rows, cases, strict=True):
         row["pose"], row["limited"], row["k"] = (0.0, case.offset, case.turn), case.limited, (K_X, K_Y, case.k_theta)
-    rows["hold"] = round(period / STEP)
+    rows["period"], rows["hold"] = period, round(period / STEP)
     rows["limiter"]["time_constant"], rows["limiter"]["command"] = period, (SPEED, 0.0)
     record = np.empty((round(DURATION / STEP), len(cases), 3))
     drive(np.zeros(3), np.array([SPEED, 0.0]), np.zeros(2), LIMITS[:2], LIMITS[2:], rows, record)
