@@ -78,8 +78,8 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
         if port != 8080 and not view:
             raise InputError("port: belongs to --view")
         if suite:
-            own = "prior learner perturbation seed initial-spread goal start map compare speed margin avoid json view"
-            if world or set(own.split()) & fields_set(arguments):
+            own = {"prior", "learner", "perturbation", "seed", "initial-spread", "goal", "start", "map", "compare"}
+            if world or (own | {"speed", "margin", "avoid", "json", "view"}) & fields_set(arguments):
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
             return _navigate_suite(chosen, quick, out or Path("navigate_suite"), scheduler)
         if quick or scheduler is not None:

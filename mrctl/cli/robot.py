@@ -120,7 +120,8 @@ def tune(
         chassis: Body that carries the wheels; by default the one at their root.
         world: World to measure in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
         delay: Delays of the loop in s in addition to sample and hold, each a multiple of the control period.
-        lag: Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones.
+        lag: Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones; not
+            with --time-constant.
         time_constant: Time constant of the closed loop in s, for the IMC rule in place of the design.
         search: Feedforward whose settings to search, such as model+rls; none for the PID; or one of your own, such as
             my_file.py:MyController, whose class has an attribute such as search = {"gain": (0.01, 1.0)}.
@@ -141,6 +142,8 @@ def tune(
         return
     if tier != TIERS:
         raise InputError("tier: is of --search; the design takes its delays from --delay")
+    if time_constant is not None and lag:
+        raise InputError("lag: has no effect with --time-constant, as the IMC rule knows no lag")
     check_world(world, RobotFile.from_dict({"path": robot}, "robot"))
     from mrctl.experiments import tuning
     from mrctl.physics.mjcf import load_robot

@@ -19,7 +19,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.navigation import planning
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.hybrid_astar import cost_to_go, plan, space
-from mrctl.navigation.mppi import MAX_COST_DIFFERENCE, NOISE, SAMPLES, TEMPERATURE, Mppi
+from mrctl.navigation.mppi import MAX_COST_DIFFERENCE, SAMPLE_DEVIATIONS, SAMPLES, TEMPERATURE, Mppi
 from mrctl.navigation.planning import Avoid, prepared
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
 from mrctl.navigation.tasks import task_of
@@ -164,7 +164,7 @@ def _mppi(turns: int) -> dict[str, Any]:
         stage.output(pose, twist, np.zeros((1, 7)))
     arguments = watched.call_args.args
     (bounds,) = stage.bounds
-    spread = np.array(NOISE) * (bounds.speed, bounds.rotation)
+    spread = np.array(SAMPLE_DEVIATIONS) * (bounds.speed, bounds.rotation)
     knots = np.random.default_rng(0).standard_normal((SAMPLES, KNOTS, 2)) * spread
     nominal, period, scene = np.zeros((STEPS, 2)), own.motion_period, arguments[-1]
     twists, costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)

@@ -49,7 +49,7 @@ NO_SPREAD = (0.0, 0.0, 0.0)  # no initial offset, which would hide what learning
 FAST, SHORT, LONG = 9.0, 12.0, 18.0  # s, lap times: near the robot's limits, the benchmark's, a slow one to learn on
 LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; few, so that runs share a batch
 RANDOM_LAPS = 4
-LIMIT_SHARE = 0.8  # share of the robot's limits that a random spline may ask for
+SPLINE_LIMIT_SHARE = 0.8  # share of the robot's limits that a random spline may ask for
 RELIED_FRICTION = 0.3  # tyre friction that a random spline relies on
 NO_WORSE = 1.02  # ratio to the error of PID alone up to which a feedforward does no harm
 MUCH_WORSE = 5.0  # and above which it does much
@@ -291,9 +291,9 @@ _KINDS = {
 
 def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
     """Draws a spline at changing speed; its lap time is the least of `LAP_TIMES` within the margins, or the next."""
-    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / LIMIT_SHARE})
+    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / SPLINE_LIMIT_SHARE})
     while True:
-        course = random_spline(random, careful, LIMIT_SHARE, LIMIT_SHARE)
+        course = random_spline(random, careful, SPLINE_LIMIT_SHARE, SPLINE_LIMIT_SHARE)
         slower = int(random.integers(2))
         if times := [time for time in LAP_TIMES if time >= course.period]:
             return slowed(course, times[min(slower, len(times) - 1)])

@@ -127,11 +127,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     every = [Series(name, k) for name in CONTROLLERS for k in range(len(SPEEDS))]
     every += [Series(name, len(SPEEDS) - 1, posture_known=True) for name in CONTROLLERS]
     left = [series for series in every if series.key not in journal]
-    seconds = (
-        sum(one.references[series.speed].period for series in left for one in draws)
-        * len(PLANTS)
-        / SIMULATED_PER_SECOND
-    )
+    simulated = sum(one.references[series.speed].period for series in left for one in draws) * len(PLANTS)
+    seconds = simulated / SIMULATED_PER_SECOND
     print(f"{count * len(PLANTS) * len(left):,} runs, {journal.expected(seconds, len(left))}", flush=True)
     size = len(CONTROLLERS), len(PLANTS), count
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
@@ -273,9 +270,8 @@ def critical_widths(found: Found, shown: str) -> Table:
 
 def critical_speeds(found: Found, shown: str) -> Table:
     """Returns the table of the critical speeds."""
-    fits = np.cumprod(found.needed <= found.plans + ALLOWANCE, axis=0).sum(
-        axis=0
-    )  # how many speeds, from the slowest on
+    # How many speeds, from the slowest on.
+    fits = np.cumprod(found.needed <= found.plans + ALLOWANCE, axis=0).sum(axis=0)
     critical, rows = np.array([0.0, *found.speeds])[fits], []
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):

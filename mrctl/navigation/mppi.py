@@ -21,7 +21,7 @@ TEMPERATURE = 0.05  # λ, in units of the cost; chosen
 ORDINARY_SPEED = 0.2  # m/s, largest V below which λ falls as V², as the costs by which the roll-outs differ do; chosen
 MAX_COST_DIFFERENCE = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
 SHOWN_SAMPLES = 40  # of the samples, which are kept to be looked at
-NOISE = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
+SAMPLE_DEVIATIONS = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
 MAX_LAG = 10.0  # s
 MAX_LEFT = 0.5  # share of the way to its target that may be left at the end of a roll-out that gets on; chosen
 
@@ -67,7 +67,7 @@ class Mppi(Reactive):
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""
         nominal, twists, costs, bounds = self._nominal[row], self._twists, self._costs, self.bounds[row]
-        knots = self._noise * (np.array(NOISE) * (bounds.speed, bounds.rotation))
+        knots = self._noise * (np.array(SAMPLE_DEVIATIONS) * (bounds.speed, bounds.rotation))
         knots[0] = 0.0  # one roll-out is nominal, and another brakes
         knots[1] = -bounds.speed, 0.0
         nominal[:-1] = nominal[1:].copy()  # a period has passed

@@ -24,7 +24,8 @@ from mrctl.theory.robot import Robot
 
 BRAKING_SHARE = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
 RIM_RADIUS = 0.02  # m, radius of the discs around the robot, which reach as far beyond its footprint
-MAP_MARGIN, MOVING_MARGIN = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
+# m, margins of these discs from what is on the map and from what moves; chosen
+STANDING_MARGIN, MOVING_MARGIN = 0.02, 0.1
 # m, for errors of tracking: by so much the margin from the map is at least below that of the plan
 TRACKING_MARGIN = 0.01
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
@@ -95,7 +96,7 @@ class Pacer:
         self._plan = np.hstack(plan.sample(np.asarray(step * ticks, float)))
         # The margin from the map is smaller than what the plan has, and negative where the discs overlap the map on it.
         free = least_clearance(footprint, plan, self._planner.sight.map)
-        self._kept = self._barrier(min(MAP_MARGIN, free - RIM_RADIUS - TRACKING_MARGIN))
+        self._kept = self._barrier(min(STANDING_MARGIN, free - RIM_RADIUS - TRACKING_MARGIN))
         self._clock, self._anchor = 0.0, 0.0  # the clock in motion periods: now, and where the robot last made headway
         self._place = np.inf  # the clock at which the plan is blocked, in motion periods; infinite where it is free
         self._stops = False  # whether the robot stops for a shorter way

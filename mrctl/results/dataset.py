@@ -117,8 +117,8 @@ FAULTS = {
 }
 
 # Attribute of a saved result: its variables, each of whose files holds all chunks, even with only NaN.
-COMPLETE = "variables"
-COMPLETE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
+VARIABLE_NAMES = "variables"
+ALL_CHUNKS_BEFORE_0_10_2 = "all_chunks"  # the same without their names
 CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
 ADDED_SIGNALS = (  # signals that results of older versions lack
@@ -285,7 +285,7 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         checked = {str(name): {"compressors": (ZstdCodec(), Crc32cCodec())} for name in result.variables}
-        result = result.assign_attrs({COMPLETE: sorted(map(str, result.variables))})
+        result = result.assign_attrs({VARIABLE_NAMES: sorted(map(str, result.variables))})
         result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False, encoding=checked, write_empty_chunks=True)
         _seal(partial)
         partial.rename(path)
@@ -467,16 +467,16 @@ def open_result(path: str | Path) -> xr.Dataset:
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
         if CHECKSUMS in result.attrs:
             _check_sums(Path(path), dict(result.attrs.pop(CHECKSUMS)))
-    if gone := set(result.attrs.get(COMPLETE, ())) - set(result.variables):
+    if gone := set(result.attrs.get(VARIABLE_NAMES, ())) - set(result.variables):
         raise InputError(f"{Path(path) / min(gone)}: missing")
     for folder, array in arrays.items():
-        whole = {COMPLETE, COMPLETE_BEFORE_0_10_2} & set(result.attrs)
+        whole = {VARIABLE_NAMES, ALL_CHUNKS_BEFORE_0_10_2} & set(result.attrs)
         if whole and (lost := array.nchunks - array.nchunks_initialized):
             raise InputError(f"{folder}: {lost} chunks are missing")
     for name in result.variables:
         with reading_chunks(f"{path}/{name}"):
             result.variables[name].load()  # alone, without its coordinates
-    for name in (COMPLETE, COMPLETE_BEFORE_0_10_2):
+    for name in (VARIABLE_NAMES, ALL_CHUNKS_BEFORE_0_10_2):
         result.attrs.pop(name, None)
     if missing := NEEDED_ATTRIBUTES - set(result.attrs):
         raise InputError(f"{path}: not a saved result: no {min(missing)}")

@@ -57,7 +57,7 @@ LOST_DEVIATION = 0.5  # m and rad, standard deviation that is added to the postu
 INNOVATION_FIXES = 30  # fixes, time constant of the running mean of their innovations; chosen
 DRIFT_SIGMAS = 4.5  # standard deviations of that mean above which dead reckoning drifts; chosen
 SLIP_SIGMAS = 6.0  # standard deviations of the innovation of an encoder, above which its wheel has slipped; chosen
-SLIP_SPEED = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
+SLIPPING_SPEED = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 GRIP_DIFFERENCE = 2e-3  # m/s, difference of the slip of two wheels that grip
 RADIUS_AVERAGE = 1.0  # s, time constant of the mean of the wheels' difference, by which another radius is found; chosen
 # m/s² and rad/s², standard deviations of V̇ and of the mean θ̈ from where the last sample of a slow sensor was taken to
@@ -343,7 +343,7 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
         V ← V + T (a − o) + 2 ω₀ T e,    o ← o − ω₀² T e,    e = mean of v_l,r − (V ∓ D ω) over the wheels that grip
 
     It has the bandwidth ω₀ = `OBSERVER_BANDWIDTH`, and its offset o is faster than that of the filter. A wheel slips if
-    its own difference is larger than `SLIP_SPEED` plus one count, or if it is the larger one and the two together
+    its own difference is larger than `SLIPPING_SPEED` plus one count, or if it is the larger one and the two together
     contradict the gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by
     three times `HELD_NOISE` then.
 
@@ -358,7 +358,9 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     omega = now.gyro - s.mean[BIAS]
     ahead = s.inertial + period * (now.acceleration[0] + geometry.imu_x * omega * omega - s.offset)
     waits, turn = period * (sensor.accelerometer_every - 1), HELD_NOISE[1] * period * (sensor.gyro_every - 1)
-    bound = SLIP_SPEED + r * sensor.quantum / (period * sensor.encoder_every) + 3 * (HELD_NOISE[0] * waits + D * turn)
+    bound = (
+        SLIPPING_SPEED + r * sensor.quantum / (period * sensor.encoder_every) + 3 * (HELD_NOISE[0] * waits + D * turn)
+    )
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound

@@ -96,7 +96,7 @@ def test_random_scenario_is_a_function_of_its_seed(robot):
 def test_random_robots_can_follow_and_stand(robot):
     """Each reference changes its speed, keeps its margin, and has a lap time of the list; no payload tips the robot."""
     limits = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
-    careful = {name: 1.01 * cases.LIMIT_SHARE * getattr(robot, name) for name in limits}
+    careful = {name: 1.01 * cases.SPLINE_LIMIT_SHARE * getattr(robot, name) for name in limits}
     careful = robot.model_copy(update={**careful, "tyre_friction": 1.01 * cases.RELIED_FRICTION})
     nominal, spread = mjcf.load(), []
     for scenario in cases.random_scenarios(12):
