@@ -384,6 +384,13 @@ def free_length(pose: Array, turn: float, radius: float, way: float, where: Spac
 
 
 @kernel
+def copy_pose(source: Array, target: Array) -> None:
+    """Copies a pose, `(3,)`."""
+    for k in range(3):
+        target[k] = source[k]
+
+
+@kernel
 def cost_of(way: float, last: float) -> float:
     """Returns the cost of a way in m, negative in reverse, after one in the direction `last`, 0 at the start."""
     switch = SWITCH_COST if way * last < 0 else 0.0
@@ -429,7 +436,7 @@ def analytic_expansion(
         free += driven
         if driven < abs(lengths[k]):
             return np.inf, direction, free
-        now[:] = end
+        copy_pose(end, now)
     return cost, direction, free
 
 
@@ -480,7 +487,8 @@ def search(
     weight, gears = HEURISTIC_WEIGHT if ahead.any() else 0.0, best.shape[3]
     sides, end = np.empty((len(where.footprint), 4)), np.empty(3)
     turns, lengths = np.zeros(MAX_PIECES), np.zeros(MAX_PIECES)
-    tree.poses[0], tree.parents[0], tree.turns[0], tree.lengths[0], tree.costs[0] = start, -1, 0.0, 0.0, 0.0
+    copy_pose(start, tree.poses[0])
+    tree.parents[0], tree.turns[0], tree.lengths[0], tree.costs[0] = -1, 0.0, 0.0, 0.0
     tree.direct[0], tree.again[0] = shortest(start, goal, radius, reverse, turns, lengths), 0.0
     checks = int(np.ceil(step / CHECK_SPACING))  # of an arc, as `free_length` makes them, to the last bit of its end
     queue, late, expanded, left = [(0.0, 0)], [0 for _ in range(0)], 0, False
@@ -512,7 +520,8 @@ def search(
                 cost, direction, free = analytic_expansion(pose, goal, radius, reverse, last, np.inf, where, sides, end)
                 tree.again[now] = tree.costs[now] + RETRY_SHARE * free
                 if cost < np.inf:
-                    tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n] = goal, now, SHORTEST_PATH, direction
+                    copy_pose(goal, tree.poses[n])
+                    tree.parents[n], tree.turns[n], tree.lengths[n] = now, SHORTEST_PATH, direction
                     tree.costs[n] = tree.costs[now] + cost
                     heapq.heappush(queue, (tree.costs[n], n))
                     n += 1
@@ -532,7 +541,8 @@ def search(
                 continue
             tree.direct[n] = shortest(end, goal, radius, reverse, turns, lengths)
             estimate = weight * max(ahead[row, column] - HEURISTIC_SLACK * cell, tree.direct[n])
-            tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n], tree.costs[n] = end, now, turn, way, cost
+            copy_pose(end, tree.poses[n])
+            tree.parents[n], tree.turns[n], tree.lengths[n], tree.costs[n] = now, turn, way, cost
             tree.again[n], best[row, column, heading, gear] = tree.again[now], n + 1
             heapq.heappush(queue, (cost + estimate, n))
             n += 1

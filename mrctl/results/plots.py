@@ -499,7 +499,10 @@ def _rms(runs: Sequence[xr.Dataset], name: str) -> str:
     if any(run.get("failed", True) and not fine.all() for run, fine in zip(runs, finite, strict=True)):
         return "failed"
     squares = np.concatenate([np.square(one[fine]) for one, fine in zip(errors, finite, strict=True)])
-    return f"RMS {MILLI * np.sqrt(squares.mean()):.2g}" if len(squares) else "RMS –"
+    if not len(squares):
+        return "RMS –"
+    rms = MILLI * np.sqrt(squares.mean())
+    return f"RMS {rms:.2g}" if rms < 99.5 else f"RMS {rms:.0f}"
 
 
 def _finished(values: Array, failed: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:

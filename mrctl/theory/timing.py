@@ -331,7 +331,8 @@ def bounds(rows: Array, first: Array, last: Array, found: Array) -> None:
     """
     n = len(rows)
     for k in range(len(first)):
-        found[k] = rows[first[k] % n]
+        for i in range(rows.shape[1]):
+            found[k, 0, i] = found[k, 1, i] = rows[first[k] % n, i]
         for j in range(first[k] + 1, last[k] + 1):
             row = rows[j % n]
             for i in range(len(row)):

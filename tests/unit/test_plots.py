@@ -158,7 +158,7 @@ def test_compare_errors():
     for axes, name in zip(figure.axes, plots.ERRORS, strict=True):
         assert drawn(axes, result["time"], 1e3 * pid[name]) and drawn(axes, result["time"], 1e3 * nn[name][0])
         rms = [1e3 * np.sqrt(np.mean(one[name].values ** 2)) for one in (pid, nn)]
-        assert [text.get_text() for text in axes.texts] == [f"RMS {value:.2g}" for value in rms]
+        assert [text.get_text() for text in axes.texts] == [f"RMS {value:.0f}" for value in rms]
     failed = plots.compare_errors(pid, fail(nn, 0, 3.0))
     assert failed.axes[0].texts[1].get_text() == "failed" and legend(failed)[1].endswith("(failed)")
 
@@ -178,6 +178,8 @@ def test_compare_errors_of_shorter_runs():
     both = fail(padded, 1, 3.0)
     assert texts(plots.compare_errors(pid, both, window=(0, 2))) == ["RMS 2", "RMS 2"]  # before it failed
     assert texts(plots.compare_errors(pid, both)) == ["RMS 2", "failed"]
+    far = pid.assign(lateral_error=pid["lateral_error"] * 306.25)
+    assert texts(plots.compare_errors(far, pid)) == ["RMS 612", "RMS 2"]  # without an exponent
 
 
 def test_learning_curve():
