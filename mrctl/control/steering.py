@@ -18,7 +18,7 @@ ALLOCATION = np.dtype(
         ("feedforward", "f8", 2),  # part from feedforward, V; it includes the differential of `rigid` steering
         ("command", "f8", 4),  # voltages left and right in V, steering angle in rad, steering rate in rad/s
         ("excess", "f8", 2),  # the two channels after the limits less before them, V (rad/s on a steering channel)
-        ("saturated", "?"),  # whether a limit of voltage or current acted, or under `rigid` steering one of the angle
+        ("saturated", "?"),  # whether voltage or current, or under `rigid` steering the fork, could not follow
     ],
     align=True,
 )
@@ -115,12 +115,13 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
         s.feedback[0], s.feedback[1] = feedback[0] - feedback[1], feedback[0] + feedback[1]
     s.feedforward[0], s.feedforward[1] = feedforward[0] - differential, feedforward[0] + differential
 
-    if abs(s.angle) > robot.steering_limit:
+    limited = abs(s.angle) > robot.steering_limit
+    if limited:
         s.angle = robot.steering_limit if s.angle > 0 else -robot.steering_limit
         s.rate = 0.0
-        if robot.rigid:
-            s.excess[1] = scrub_free_rotation(v, s.angle, robot.wheelbase, robot.trail) - omega
-            s.saturated = True
+    if robot.rigid and (limited or not abs(v) > HOLD_SPEED):  # at rest the fork is held and makes no θ̇
+        s.excess[1] = scrub_free_rotation(v, s.angle, robot.wheelbase, robot.trail) - omega
+        s.saturated = limited or s.excess[1] != 0.0
     middle = s.angle + s.rate * period / 2  # the middle of the period for which the set-point is held
     s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate
 

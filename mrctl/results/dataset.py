@@ -78,7 +78,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "steering_rate_command": ("rad/s", "commanded steering rate"),
     "saturated": (
         "1", "whether a limit acted on the sum of feedback and feedforward: that of the supply, of the driver's "
-        "current or, with `rigid` steering, of the steering angle",
+        "current or, with `rigid` steering, of the steering angle, which is held at rest",
     ),
     "weight_norm": ("1", "size of what the feedforward has learned"),
     "current_left": ("A", "left motor current"),

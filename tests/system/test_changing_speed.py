@@ -1,4 +1,4 @@
-"""A nominal robot on random splines at changing speed needs the voltages that the time law foresees."""
+"""Changing speed: the voltages that the time law foresees, and a stop in which nothing winds up."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from mrctl import Scenario
 from mrctl.experiments.paper import IDEAL
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.theory.references import random_spline
+from mrctl.theory.references import StopAndGo, random_spline
 from mrctl.theory.timing import Limits
 
 ROBOT = read_robot(mjcf.load())
@@ -27,3 +27,12 @@ def test_no_saturation(steering):
         assert not found["failed"] and found["v_rmse"] < 0.02 and found["position_rmse"] < 0.01
         acceleration = course.sample(np.linspace(0, course.period, 1000)).acceleration[:, 0]
         assert acceleration.std() > 0.1  # the mass along x is excited
+
+
+def test_long_stop():
+    """With rigid steering a noisy gyro does not turn the fork of a robot that has stood for half a minute."""
+    common = {"learner": "none", "steering": "rigid", "laps": 1, "sensing": {"tier": "field", "estimator": "ekf"}}
+    result = mrctl.simulate([Scenario.from_dict(common | {"reference": StopAndGo(pause=30.0), "seed": 1})], threads=1)
+    (angle,), time = np.abs(result["steering_command"].values), result["time"].values
+    start = int(np.argmax(time >= 33.0))  # when it drives on
+    assert angle[start : start + 400].max() < 1.2 * angle[:start].max()

@@ -130,6 +130,16 @@ def test_rest(robot, rigid, twist, acceleration, angle):
     assert command[2:].tolist() == [angle, 0]
 
 
+@given(twist=numbers(2, 0.9 * HOLD_SPEED), feedback=numbers(2, 1.0), feedforward=numbers(2, 1.0))
+def test_rest_of_rigid_steering(stiff, twist, feedback, feedforward):
+    """A fork that is held makes the θ̇ of its angle; the rest of what was asked is excess, which unwinds an integral."""
+    allocation = Allocation(stiff, rigid=True, angle=0.3)
+    allocation(twist, feedback=feedback, feedforward=feedforward)
+    made = twist[0] * np.tan(0.3) / stiff.wheelbase
+    assert allocation.excess[1] == pytest.approx(made - twist[1] - feedback[1] - feedforward[1], abs=1e-12)
+    assert allocation.saturated == (allocation.excess[1] != 0)
+
+
 @pytest.mark.parametrize("rigid", [False, True])
 @given(twist=numbers((8, 2), 3.0), acceleration=numbers((8, 2), 6.0), feedback=numbers((8, 2), 9.0))
 def test_steering_limit(robot, stiff, rigid, twist, acceleration, feedback):
@@ -166,8 +176,8 @@ def test_rigid_voltages(stiff, feedback, correction, feedforward, twist):
     asked = allocation.parts[:2] + allocation.parts[2:]
     np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
     assert allocation.excess[0] == pytest.approx((voltage - asked).mean(), abs=1e-12)
-    at_stop = abs(allocation.angle) == stiff.steering_limit
-    assert allocation.saturated == ((np.abs(asked) > 24).any() or at_stop)
+    held = abs(allocation.angle) == stiff.steering_limit or (abs(twist[0]) <= HOLD_SPEED and allocation.excess[1] != 0)
+    assert allocation.saturated == ((np.abs(asked) > 24).any() or held)
 
 
 def test_rigid_correction(stiff):
