@@ -8,9 +8,12 @@ warnings, times of execution, and tables in HTML with random names.
 
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import nbformat
+from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parent
@@ -18,12 +21,17 @@ KEPT = "image/png", "text/plain"
 REPLAY = "(The replay is shown when the notebook runs.)"
 
 
-def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
-    """Returns a notebook after a run in a folder, with all outputs; an exception in a cell is raised."""
+def executed(path: Path, folder: Path, kernel: KernelManager) -> nbformat.NotebookNode:
+    """Returns a notebook after a run in a folder, with all outputs; an exception in a cell is raised.
+
+    The kernel first forgets the names of the notebook before. It starts once for all notebooks, because the imports and
+    the compiled laws take seconds.
+    """
     notebook = nbformat.read(path, as_version=4)
-    where = {"metadata": {"path": folder}}
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n__spec__ = None\n%cd -q {folder}"))
     # The kernel sends what a cell prints in as many pieces as the load of the machine makes.
-    NotebookClient(notebook, timeout=600, record_timing=False, coalesce_streams=True, resources=where).execute()
+    NotebookClient(notebook, km=kernel, timeout=600, record_timing=False, coalesce_streams=True).execute()
+    del notebook.cells[0]
     return notebook
 
 
@@ -51,8 +59,20 @@ def _cleaned(output: nbformat.NotebookNode) -> nbformat.NotebookNode | None:
     return nbformat.from_dict({**output, "data": data, "metadata": {}})
 
 
+@contextmanager
+def started() -> Iterator[KernelManager]:
+    """Starts a kernel, and stops it in the end."""
+    kernel = KernelManager(kernel_name="python3")
+    kernel.start_kernel(extra_arguments=["--HistoryManager.hist_file=:memory:"])  # as nbclient starts it
+    try:
+        yield kernel
+    finally:
+        kernel.shutdown_kernel(now=True)
+
+
 if __name__ == "__main__":
-    for path in [FOLDER / name for name in sys.argv[1:]] or sorted(FOLDER.glob("*.ipynb")):
-        with tempfile.TemporaryDirectory() as folder:
-            nbformat.write(cleaned(executed(path, Path(folder))), path)
-        print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB")
+    with started() as kernel:
+        for path in [FOLDER / name for name in sys.argv[1:]] or sorted(FOLDER.glob("*.ipynb")):
+            with tempfile.TemporaryDirectory() as folder:
+                nbformat.write(cleaned(executed(path, Path(folder), kernel)), path)
+            print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB")

@@ -26,7 +26,15 @@ ROBOT = "window.__viserMutable?.nodePoseData['/world/robot/chassis']?.position"
 _spec = importlib.util.spec_from_file_location("regenerate", FOLDER / "regenerate.py")
 regenerate = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(regenerate)
+pytestmark = pytest.mark.xdist_group("notebooks")  # which share a kernel
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
+
+
+@pytest.fixture(scope="module")
+def kernel():
+    """A kernel for all notebooks."""
+    with regenerate.started() as found:
+        yield found
 
 
 def named(path):
@@ -56,12 +64,12 @@ def test_committed_clean(path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=named)
-def test_notebook(path, tmp_path):
+def test_notebook(path, kernel, tmp_path):
     """It runs from top to bottom with all its assertions; as a file, without server or network, it shows everything.
 
     It says what the committed file says: the same words, and the same numbers to one in a hundred.
     """
-    notebook = regenerate.executed(path, tmp_path)
+    notebook = regenerate.executed(path, tmp_path, kernel)
     for found, kept in zip(texts(regenerate.cleaned(notebook)), texts(nbformat.read(path, as_version=4)), strict=True):
         assert NUMBER.sub("#", found).split() == NUMBER.sub("#", kept).split()
         numbers = (np.array(NUMBER.findall(text), float) for text in (found, kept))
