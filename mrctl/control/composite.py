@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import CHANNELS, FEATURES, STICTION_SPEED, feature_scale, features, symmetric_product
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, explained
-from mrctl.control.matching import SETTLING_TIMES, histories, low_pass, note_sent, recall
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown, explained
+from mrctl.control.matching import SETTLING_TIMES, histories, low_pass, recall, sent
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -176,15 +176,15 @@ def filter_twice(signal: Array, once: Array, twice: Array, share: float, begins:
 
 
 @kernel
-def filter_motion(command: Array, twist: Array, voltage: Array, period: float, robot: Row, s: Row) -> None:
+def filter_motion(shown: Shown, robot: Row, s: Row) -> None:
     """Passes voltage, twist and heading through the two filters, and estimates the noise of the twist.
 
         V̇_f = (once − twice)/T,    var V = mean (V_n − 2 V_n−1 + V_n−2)²/6
 
     The second difference of independent noise has six times the variance of that noise.
     """
-    s.heading += period * twist[1]
-    now, once, twice = s.now, s.once, s.twice
+    twist, now, once, twice = shown.twist, s.now, s.once, s.twice
+    s.heading += shown.period * twist[1]
     now.twist[0], now.twist[1] = twist[0], twist[1]
     now.direction[0], now.direction[1] = np.cos(s.heading), np.sin(s.heading)
     filter_twice(now.voltage, once.voltage, twice.voltage, s.filter, s.age == 0)
@@ -196,8 +196,8 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
         difference = twist[k] - 2 * s.last[0, k] + s.last[1, k]
         s.variance[k] += s.lasting * (difference * difference / 6 - s.variance[k])
         s.last[1, k], s.last[0, k] = s.last[0, k], twist[k]
-        s.rate[k] = (once.twist[k] - twice.twist[k]) * s.filter / (1 - s.filter) / period
-    note_sent(voltage, command, robot.rigid, now.voltage)
+        s.rate[k] = (once.twist[k] - twice.twist[k]) * s.filter / (1 - s.filter) / shown.period
+        now.voltage[k] = sent(k, shown, robot.rigid)
     s.age += s.filter
 
 
@@ -212,10 +212,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One step of prediction and tracking; while the robot must not learn, the disturbance decays.
 
     `added` leaves the disturbance out, so that the PID's integral keeps its part of it, as with `observer`.
@@ -223,11 +220,11 @@ def learn(
     rows, scale, queue = arrays
     s = rows[i]
     answered = recall(s.phi_c, queue[i], s)
-    filter_motion(command, twist, voltage, period, robot, s)
+    filter_motion(shown, robot, s)
     added[0] = added[1] = 0.0
     motion = s.twice
     moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > STICTION_SPEED
-    if moves and s.age > SETTLING_TIMES and frozen == 0:
+    if moves and s.age > SETTLING_TIMES and shown.frozen == 0:
         composite_regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
         explained(motion.twist, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
@@ -235,8 +232,8 @@ def learn(
             added[k] = learned_voltage(s.a[k], s.phi_c)
             predict(k, s)
             if answered:
-                track(k, feedback[k], s)
-        detect_change(period, s)
+                track(k, shown.feedback[k], s)
+        detect_change(shown.period, s)
         for k in range(CHANNELS):
             added[k] = learned_voltage(s.a[k], s.phi_c) - added[k]
     else:

@@ -161,6 +161,25 @@ class Prior:
         return np.ascontiguousarray(motion["voltage"])
 
 
+class Shown(NamedTuple):
+    """What a learner is shown of one robot in a control tick."""
+
+    command: Array
+    """Commanded V in m/s and θ̇ in rad/s, `(2,)`."""
+    derivative: Array
+    """Their derivatives in m/s² and rad/s², `(2,)`."""
+    feedback: Array
+    """Output of the PID that teaches, in V (rad/s on a steering channel), `(2,)`."""
+    frozen: float
+    """1 where nothing may be learned from this tick, else 0."""
+    twist: Array
+    """Predicted V in m/s and θ̇ in rad/s, on which the voltage has not acted yet, `(2,)`."""
+    voltage: Array
+    """Voltage of the channels in the coming period, after the limits, in V (rad/s on a steering channel), `(2,)`."""
+    period: float
+    """Control period in s."""
+
+
 class Loop(NamedTuple):
     """What the learners of a group of robots know of the loop in which they drive."""
 
@@ -185,9 +204,9 @@ class Learner(ABC):
 
     Attributes:
         respond: `(i, command, derivative, robot, arrays, voltage)` writes the output of robot i to `voltage`, `(2,)`.
-        learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, prior, arrays, added)` learns, writes
-            the change of the output of robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is
-            the record of `PRIOR` of robot i.
+        learn_one: `(i, shown, robot, prior, arrays, added)` learns from a `Shown`, writes the change of the output of
+            robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is the record of `PRIOR` of
+            robot i.
         rows: One record a robot: its memory and its settings.
         arrays: Memory and constants of the kernels, a tuple of arrays.
         prior: The prior that is added to its output; at first nothing.
@@ -277,10 +296,7 @@ def nothing(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 
 
 @kernel
-def learn_nothing(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn_nothing(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """Learns nothing."""
     added[0] = added[1] = 0.0
     return 0.0
@@ -303,10 +319,9 @@ def learn_all(
 ) -> None:  # fmt: skip
     """Does one learning step of all robots."""
     for i in range(len(added)):
-        norm[i] = learn_one(
-            i, motion[i].command, feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], prior[i], arrays,
-            added[i],
-        )  # fmt: skip
+        command, derivative = motion[i].command, motion[i].derivative
+        shown = Shown(command, derivative, feedback[i], frozen[i], twist[i], voltage[i], period)
+        norm[i] = learn_one(i, shown, robot[0], prior[i], arrays, added[i])
 
 
 class NoLearner(Learner):

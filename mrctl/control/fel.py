@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import CHANNELS, FEATURES, feature_scale, features
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import histories, recall
 from mrctl.control.weights import hidden_units, initial_weights, load_weights, shapes
 from mrctl.kernel import Array, Row, Rows, kernel
@@ -204,10 +204,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One step of `update`, unless the robot must not learn.
 
     `added` is by how much that changes the output in V (rad/s on a steering channel), `(2,)`, and the result ‖W − W₀‖.
@@ -217,9 +214,9 @@ def learn(
     s = rows[i]
     added[0] = added[1] = 0.0
     answered = recall(s.x, queue[i], s)
-    if frozen == 0 and s.step > 0 and answered:
+    if shown.frozen == 0 and s.step > 0 and answered:
         before, before_second = s.output[0], s.output[1]
-        update(feedback, s, weights[i], initial[i], hidden[i], gradient)
+        update(shown.feedback, s, weights[i], initial[i], hidden[i], gradient)
         if s.norm < s.bound:
             added[0], added[1] = s.output[0] - before, s.output[1] - before_second
     return s.norm

@@ -45,25 +45,24 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import FEATURES
-from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, explained, prior_voltage
-from mrctl.control.matching import MATCHED, low_pass, match, note_sent, queues
+from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, Shown, explained, prior_voltage
+from mrctl.control.matching import MATCHED, low_pass, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 
 
 @kernel
-def measure(twist: Array, rigid: bool, period: float, queue: Rows, s: Row) -> None:
+def measure(shown: Shown, rigid: bool, queue: Rows, s: Row) -> None:
     """Measures U_f − M ẋ_f; until a voltage has acted, it is f̂ of the model, so that the law starts without a bump.
 
     Args:
-        twist: Predicted V in m/s and θ̇ in rad/s, `(2,)`.
+        shown: What this tick shows of the robot.
         rigid: Whether the second channel is steering.
-        period: Control period in s.
         queue: In and out: that of `match`, `(d + 1,)`.
         s: In and out: a record of `INDI`, whose `twice` is the result.
     """
     m, c = s.matched, s.prior.c
-    s.started = match(twist, s.derivative, s.sent, period, queue, m)
+    s.started = match(shown, rigid, queue, m)
     explained(m.twist, s.zero, rigid, s.prior, s.rest)
     for k in range(2):
         if rigid and k == 1:
@@ -82,22 +81,17 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     s = arrays[0][i]
     prior_voltage(command, s.zero, s.prior, s.rest)
     for k in range(2):
-        s.derivative[k] = derivative[k]
         voltage[k] = s.twice[k] - s.rest[k] if s.started else 0.0
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One measurement, which goes on while the robot must not learn: the voltage is the one after the limits."""
     rows, queue = arrays
     s = rows[i]
     for j in range(FEATURES):
         s.prior.c[j, 0], s.prior.c[j, 1] = prior.c[j, 0], prior.c[j, 1]
-    note_sent(voltage, command, robot.rigid, s.sent)
-    measure(twist, robot.rigid, period, queue[i], s)
+    measure(shown, robot.rigid, queue[i], s)
     added[0] = added[1] = 0.0
     return 0.0
 
@@ -115,8 +109,6 @@ INDI = np.dtype(
         ("share", "f8"),  # weight of a new sample in the two filters
         ("matched", MATCHED),
         ("prior", PRIOR),  # the model; its coefficients of the accelerations are M
-        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
-        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
         ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
         ("rest", "f8", 2),  # f̂ at the measured or the commanded motion, V
         ("once", "f8", 2),  # U − M ẋ after the first filter, V

@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.feedforward import Learner, Loop, explained
-from mrctl.control.matching import MATCHED, match, note_sent, queues
+from mrctl.control.feedforward import Learner, Loop, Shown, explained
+from mrctl.control.matching import MATCHED, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.linear import steering
@@ -53,19 +53,18 @@ def adapt(error: float, inertia: float, decay: float, phi: float) -> float:
 
 
 @kernel
-def step(twist: Array, rigid: bool, prior: Row, period: float, queue: Rows, s: Row) -> None:
+def step(shown: Shown, rigid: bool, prior: Row, queue: Rows, s: Row) -> None:
     """One period of the predictor, the adaptation and the low-pass.
 
     Args:
-        twist: Predicted V in m/s and θ̇ in rad/s, `(2,)`.
+        shown: What this tick shows of the robot.
         rigid: Whether the second channel is steering.
         prior: The model, a record of `PRIOR`.
-        period: Control period in s.
         queue: In and out: that of `match`, `(d + 1,)`.
         s: In and out: a record of `PREDICTOR`, whose `filtered` is the result.
     """
     m = s.matched
-    known = match(twist, s.derivative, s.sent, period, queue, m)
+    known = match(shown, rigid, queue, m)
     explained(m.last, s.zero, rigid, prior, s.rest)
     for k in range(2):
         if not known:
@@ -73,7 +72,7 @@ def step(twist: Array, rigid: bool, prior: Row, period: float, queue: Rows, s: R
             continue
         inertia = s.lag if rigid and k == 1 else prior.c[2 + k, k]
         pushed = s.phi * (m.acted[k] - s.rest[k] + s.sigma[k]) / inertia
-        drawn = (1 - s.decay) * m.last[k] + (1 - s.phi / period) * (m.twist[k] - m.last[k])
+        drawn = (1 - s.decay) * m.last[k] + (1 - s.phi / shown.period) * (m.twist[k] - m.last[k])
         s.predicted[k] = s.decay * s.predicted[k] + drawn + pushed
         s.sigma[k] = adapt(s.predicted[k] - m.twist[k], inertia, s.decay, s.phi)
         s.filtered[k] += s.share * (s.sigma[k] - s.filtered[k])
@@ -82,22 +81,15 @@ def step(twist: Array, rigid: bool, prior: Row, period: float, queue: Rows, s: R
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = −C σ̂, the latest."""
-    s = arrays[0][i]
     for k in range(2):
-        s.derivative[k] = derivative[k]
-        voltage[k] = -s.filtered[k]
+        voltage[k] = -arrays[0][i].filtered[k]
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One step, which goes on while the robot must not learn: the voltage is the one after the limits."""
     rows, queue = arrays
-    s = rows[i]
-    note_sent(voltage, command, robot.rigid, s.sent)
-    step(twist, robot.rigid, prior, period, queue[i], s)
+    step(shown, robot.rigid, prior, queue[i], rows[i])
     added[0] = added[1] = 0.0
     return 0.0
 
@@ -119,8 +111,6 @@ PREDICTOR = np.dtype(
         ("share", "f8"),  # weight of a new sample in C
         ("lag", "f8"),  # lag of the steering under `rigid`, at least a period, s
         ("matched", MATCHED),
-        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
-        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
         ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
         ("rest", "f8", 2),  # f of the model at the measured motion, V
         ("predicted", "f8", 2),  # x̂, m/s and rad/s

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mrctl.control.feedforward import Shown
 from mrctl.kernel import Array, Row, Rows, kernel
 
 SETTLING_TIMES = 6.0  # time constants until the two filters of `low_pass` have forgotten their initial state
@@ -49,18 +50,12 @@ SENT = np.dtype(
 
 
 @kernel
-def note_sent(voltage: Array, command: Array, rigid: bool, sent: Array) -> None:
-    """Notes the voltage that acts in the coming period.
+def sent(k: int, shown: Shown, rigid: bool) -> float:
+    """Returns what channel k makes in the coming period: its voltage in V or, if it is steering, θ̇ in rad/s.
 
-    Args:
-        voltage: Voltage of the two channels after the limits, in V (rad/s on a steering channel), `(2,)`.
-        command: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
-        rigid: Whether the second channel is steering, which adds a correction to the commanded rotation.
-        sent: Out: the voltage (with the whole rotation on a steering channel), `(2,)`.
+    A steering channel (the second one, if `rigid`) adds a correction to the commanded rotation.
     """
-    sent[0], sent[1] = voltage[0], voltage[1]
-    if rigid:
-        sent[1] += command[1]
+    return shown.voltage[k] + shown.command[k] if rigid and k == 1 else shown.voltage[k]
 
 
 def queues(size: int, delay: int) -> Rows:
@@ -69,14 +64,12 @@ def queues(size: int, delay: int) -> Rows:
 
 
 @kernel
-def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Rows, s: Row) -> bool:
+def match(shown: Shown, rigid: bool, queue: Rows, s: Row) -> bool:
     """Finds the voltage that acted in the period that ends now, and the motion that it made.
 
     Args:
-        twist: Predicted V in m/s and θ̇ in rad/s, on which `sent` has not acted yet, `(2,)`.
-        derivative: Commanded V̇ in m/s² and θ̈ in rad/s² of this tick, `(2,)`.
-        sent: Voltage that is computed in this tick, after the limits, `(2,)`.
-        period: Control period in s.
+        shown: What this tick shows of the robot; its voltage goes into the queue.
+        rigid: Whether the second channel is steering.
         queue: In and out: records of `SENT` of the last d + 1 ticks, `(d + 1,)`.
         s: In and out: a record of `MATCHED`, whose `twist`, `last`, `rate` and `acted` are the result.
 
@@ -86,14 +79,14 @@ def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Ro
     size = len(queue)
     oldest = s.tick % size
     for k in range(2):
-        now = twist[k]
+        now = shown.twist[k]
         for p in range(size):
             if p != oldest:
-                now -= period * queue[p].acceleration[k]
+                now -= shown.period * queue[p].acceleration[k]
         s.last[k] = s.twist[k] if s.tick > 0 else now
-        s.twist[k], s.rate[k] = now, (now - s.last[k]) / period
+        s.twist[k], s.rate[k] = now, (now - s.last[k]) / shown.period
         s.acted[k] = queue[oldest].voltage[k]
-        queue[oldest].voltage[k], queue[oldest].acceleration[k] = sent[k], derivative[k]
+        queue[oldest].voltage[k], queue[oldest].acceleration[k] = sent(k, shown, rigid), shown.derivative[k]
     s.tick += 1
     return s.tick > size
 

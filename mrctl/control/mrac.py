@@ -65,8 +65,8 @@ from pydantic import Field
 
 from mrctl.control.cholesky import factor, forward, solve
 from mrctl.control.features import FEATURES, STICTION_SPEED, feature_scale, features, linear, symmetric_product
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
-from mrctl.control.matching import MATCHED, SETTLING_TIMES, low_pass, match, note_sent, queues
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown
+from mrctl.control.matching import MATCHED, SETTLING_TIMES, low_pass, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -183,13 +183,11 @@ def dot(x: Array, y: Array) -> float:
 
 
 @kernel
-def filter_motion(command: Array, twist: Array, period: float, queue: Rows, scale: Array, robot: Row, s: Row) -> bool:
+def filter_motion(shown: Shown, queue: Rows, scale: Array, robot: Row, s: Row) -> bool:
     """Passes the mean features of the period that ends now, and the voltage that acted in it, through the two filters.
 
     Args:
-        command: Commanded twist in m/s and rad/s, `(2,)`.
-        twist: Predicted twist in m/s and rad/s, `(2,)`.
-        period: Control period in s.
+        shown: What this tick shows of the robot.
         queue: In and out: that of `match`, `(d + 1,)`.
         scale: Scales of the features, `(8,)`.
         robot: The nominal robot.
@@ -198,7 +196,7 @@ def filter_motion(command: Array, twist: Array, period: float, queue: Rows, scal
     Returns:
         Whether the filters have forgotten how they began.
     """
-    known = match(twist, s.derivative, s.sent, period, queue, s.matched)
+    known = match(shown, robot.rigid, queue, s.matched)
     for j in range(FEATURES):
         s.before[j] = s.x[j]
     features(s.matched.twist, s.zero, robot.half_track, scale, s.x)
@@ -225,27 +223,22 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     """U = φ(x_c, ẋ_c)ᵀ (â − a_0); the prior adds φ(x_c, ẋ_c)ᵀ a_0."""
     rows, scale, _ = arrays
     s = rows[i]
-    s.derivative[0], s.derivative[1] = derivative[0], derivative[1]
     features(command, derivative, robot.half_track, scale, s.phi_c)
     linear(s.phi_c, s.b, voltage)
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One step of the law, unless the robot must not learn; the feedback teaches through x_c − x, not as a voltage."""
     rows, scale, queue = arrays
     s = rows[i]
-    note_sent(voltage, command, robot.rigid, s.sent)
-    settled = filter_motion(command, twist, period, queue[i], scale, robot, s)
+    settled = filter_motion(shown, queue[i], scale, robot, s)
     now = s.matched.twist
     moves = abs(now[0]) + robot.half_track * abs(now[1]) > STICTION_SPEED
     added[0] = added[1] = 0.0
-    if settled and moves and frozen == 0:
+    if settled and moves and shown.frozen == 0:
         for k in range(2):
-            s.error[k] = command[k] - twist[k]
+            s.error[k] = shown.command[k] - shown.twist[k]
             s.residual[k] = s.twice[FEATURES + k]
             for j in range(FEATURES):
                 s.residual[k] -= s.w[j] * scale[j] * prior.c[j, k]
@@ -304,8 +297,6 @@ MRAC = np.dtype(
         ("share", "f8"),  # weight of a new sample in the two filters
         ("hand_over", "f8"),  # 1 where the PID's integral gives up a part of what learning adds, else 0
         ("matched", MATCHED),
-        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
-        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
         ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
         ("output", "f8", 2),  # φ(x_c, ẋ_c)ᵀ b after a step, V
         ("x", "f8", FEATURES),  # scaled features of the measured twist without acceleration

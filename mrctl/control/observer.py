@@ -24,14 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.feedforward import Learner, Loop, explained
-from mrctl.control.matching import note_sent
+from mrctl.control.feedforward import Learner, Loop, Shown, explained
+from mrctl.control.matching import sent
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 
 
 @kernel
-def observe(twist: Array, sent: Array, rigid: bool, prior: Row, period: float, s: Row) -> None:
+def observe(shown: Shown, rigid: bool, prior: Row, s: Row) -> None:
     """One step of the observer, for the model c · x = c_V V + c_ω ω + c_V̇ V̇ + c_ω̇ ω̇ + ….
 
         d̂ = Q (U − c · x|V̇=ω̇=0) − c_V̇ (V − Q V)/T − c_ω̇ (ω − Q ω)/T
@@ -39,14 +39,12 @@ def observe(twist: Array, sent: Array, rigid: bool, prior: Row, period: float, s
     Q = 1/(T s + 1) is discretised by implicit Euler, for which Q of the difference quotient of V is (V − Q V)/T.
 
     Args:
-        twist: Measured V in m/s and θ̇ in rad/s, on which `sent` has not acted yet, `(2,)`.
-        sent: Voltage of the coming period in the two channels, after the limits, in V, `(2,)`.
+        shown: What this tick shows of the robot.
         rigid: Whether the second channel is steering.
         prior: The model, a record of `PRIOR`.
-        period: Control period in s.
         s: In and out: a record of `OBSERVER`, whose `disturbance` is the result.
     """
-    share = period / (s.time_constant + period)
+    twist, share = shown.twist, shown.period / (s.time_constant + shown.period)
     s.rate[0] = s.rate[1] = 0.0
     explained(twist, s.rate, rigid, prior, s.steady)
     for k in range(2):
@@ -56,7 +54,7 @@ def observe(twist: Array, sent: Array, rigid: bool, prior: Row, period: float, s
             s.rate[k] = (twist[k] - s.twist[k]) / s.time_constant
         else:
             s.twist[k] = twist[k]
-        s.sent[k] = sent[k]
+        s.sent[k] = sent(k, shown, rigid)
     for k in range(2):
         s.disturbance[k] = s.voltage[k] - prior.c[2, k] * s.rate[0] - prior.c[3, k] * s.rate[1]
     s.started = True
@@ -65,20 +63,14 @@ def observe(twist: Array, sent: Array, rigid: bool, prior: Row, period: float, s
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = d̂, the latest."""
-    rows, _ = arrays
     for k in range(2):
-        voltage[k] = rows[i].disturbance[k]
+        voltage[k] = arrays[0][i].disturbance[k]
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One step of the observer, which also runs while the robot must not learn; it hands nothing over to the PID."""
-    rows, sent = arrays
-    note_sent(voltage, command, robot.rigid, sent)
-    observe(twist, sent, robot.rigid, prior, period, rows[i])
+    observe(shown, robot.rigid, prior, arrays[0][i])
     added[0] = added[1] = 0.0
     return 0.0
 
@@ -121,7 +113,7 @@ class DisturbanceObserver(Learner):
         """Takes the loop, and the settings of each robot."""
         super().__init__(loop, settings)
         self.rows["time_constant"] = [s.time_constant for s in settings]
-        self.arrays = self.rows, np.zeros(2)
+        self.arrays = (self.rows,)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets the observers of the robots with these indices."""

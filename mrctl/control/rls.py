@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import FEATURES, feature_scale, features, linear, symmetric_product
-from mrctl.control.feedforward import STEERING_SHARE, Learner, Loop
+from mrctl.control.feedforward import STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
@@ -57,17 +57,14 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 
 
 @kernel
-def learn(
-    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    prior: Row, arrays: tuple[Any, ...], added: Array,
-) -> float:  # fmt: skip
+def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...], added: Array) -> float:
     """One step of `update` on the features of the output that the feedback answers, unless it must not learn."""
     s = arrays[0][i]
     linear(s.x, s.theta, added)
     before, before_second = added[0], added[1]
     answered = recall(s.x, arrays[2][i], s)
-    if frozen == 0 and answered:
-        update(s.past, feedback, s)
+    if shown.frozen == 0 and answered:
+        update(s.past, shown.feedback, s)
         linear(s.x, s.theta, added)
     added[0] -= before
     added[1] -= before_second

@@ -18,7 +18,7 @@ from mrctl.control import delay as late
 from mrctl.control import guard as guarding
 from mrctl.control.delay import DELAY, watch_delay
 from mrctl.control.design import MotionDesign, motion
-from mrctl.control.feedforward import Learner, Loop, Prior, learn_nothing, nothing, prior_voltage
+from mrctl.control.feedforward import Learner, Loop, Prior, Shown, learn_nothing, nothing, prior_voltage
 from mrctl.control.guard import BACK_OFF, GUARD, NO_RESET_FACTOR, guard
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.learners import LEARNERS
@@ -161,10 +161,8 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
         watch(measured, model[0], robot[0], period, s)
         steer(command, derivative, s.feedback, s.guard.output, period, robot[0], s.allocation)
         finite &= apply_voltages(measured, robot[0], period, s)
-        s.weight_norm = learn_one(
-            i, command, s.guard.teaching, s.frozen, measured.twist, s.voltage, period, robot[0], prior[i], arrays,
-            s.added,
-        )  # fmt: skip
+        shown = Shown(command, derivative, s.guard.teaching, s.frozen, measured.twist, s.voltage, period)
+        s.weight_norm = learn_one(i, shown, robot[0], prior[i], arrays, s.added)
         hand_over(s)
         asks |= s.guard.forget | s.delay.due
     return finite, asks

@@ -17,7 +17,7 @@ from typing import Any
 from unittest import mock
 
 from mrctl import FEEDFORWARDS, Scenario
-from mrctl.control.feedforward import Learner, learn_nothing, nothing
+from mrctl.control.feedforward import Learner, Shown, learn_nothing, nothing
 from mrctl.control.guard import guard
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.control.limiter import limit
@@ -59,6 +59,7 @@ def laws(simulation: Simulation) -> dict[str, tuple[Kernel, tuple[Any, ...]]]:
     limiter, allocation = state["limiter"], state["allocation"]
     command, derivative = limiter["command"], limiter["derivative"]
     feedback, feedforward, voltage = state["feedback"], state["feedforward"], state["voltage"]
+    shown = Shown(command, derivative, feedback, 0.0, seen["twist"], voltage, period)
     named = {
         "posture error": (posture_error, (seen["pose"], goal["pose"], state["error"])),
         "motion controller": (kanayama, (state["error"], goal["twist"], state["kanayama"], state["request"])),
@@ -78,7 +79,7 @@ def laws(simulation: Simulation) -> dict[str, tuple[Kernel, tuple[Any, ...]]]:
         "feedforward": (stage.respond, (0, command, derivative, robot, arrays, feedforward)),
         "learning": (
             stage.learn_one,
-            (0, command, feedback, 0.0, seen["twist"], voltage, period, robot, prior, arrays, state["added"]),
+            (0, shown, robot, prior, arrays, state["added"]),
         ),
     }  # fmt: skip
     return {name: (function, arguments) for name, (function, arguments) in named.items() if function not in EMPTY}
