@@ -181,29 +181,41 @@ class Pacer:
         if self._stops:
             if abs(velocity) < ARRIVAL_SPEED:
                 self._stops = False
-                if plan := planner.plan(pose, self._driven, now):
-                    self._begin(plan, now)
+                self._take_any(pose, now)
             return
         blocked = planner.is_blocked(now)
         if self._clock - self._anchor > MIN_PACE * HEADWAY_TIME / self._period or not len(planner.sight.standing.discs):
             self._anchor, planner.got_on = self._clock, now
         if now - planner.got_on >= HEADWAY_TIME:
             planner.got_on = planner.tried = now  # where there is no other plan, it tries again later
-            if plan := planner.plan(pose, self._driven, now):
-                self._begin(plan, now)
+            self._take_any(pose, now)
         elif planner.map_changed or (blocked and now - planner.tried >= BLOCKED_RETRY):
-            left = np.inf if blocked else self._period * (len(self._plan) - self._clock)
             planner.tried = now
-            if plan := planner.plan(pose, self._driven, now, ahead=not planner.map_changed):
-                excess = self._driven[0] - plan.sample(np.zeros(1)).twist[0, 0]
-                at_once = (
-                    excess**2 < 2 * self._robot.max_acceleration * TRACKING_MARGIN
-                )  # so far it is off while it brakes
-                if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER_SHARE * left:
-                    if at_once:
-                        self._begin(plan, now)
-                    else:
-                        self._stops = not blocked
+            self._take_shorter(pose, velocity, now, blocked)
+
+    def _take_any(self, pose: Array, now: float) -> None:
+        """Takes another plan if there is one."""
+        if plan := self._planner.plan(pose, self._driven, now):
+            self._begin(plan, now)
+
+    def _take_shorter(self, pose: Array, velocity: float, now: float, blocked: bool) -> None:
+        """Takes a plan that needs less than `SHORTER_SHARE` of the time that is left, which is infinite if blocked.
+
+        Where the plan does not begin with about the speed of the robot, the robot stops for it, unless it has to stop
+        anyway because its own plan is blocked.
+        """
+        planner = self._planner
+        plan = planner.plan(pose, self._driven, now, ahead=not planner.map_changed)
+        if plan is None:
+            return
+        left = np.inf if blocked else self._period * (len(self._plan) - self._clock)
+        excess = self._driven[0] - plan.sample(np.zeros(1)).twist[0, 0]
+        off = excess**2 / (2 * self._robot.max_acceleration)  # how far the robot is off the plan while it brakes
+        if off < TRACKING_MARGIN:
+            if plan.period < SHORTER_SHARE * left:
+                self._begin(plan, now)
+        elif plan.period + abs(velocity) / self._brakes < SHORTER_SHARE * left:
+            self._stops = not blocked
 
 
 class Pacing:

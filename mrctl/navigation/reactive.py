@@ -156,17 +156,16 @@ class Agent:
             if self._gone(pose) < self._pieces * BACK[0] and self._back(pose, now):
                 return True
             self.last = np.zeros(2)
-            other = self.planner.plan(pose, self.last, now)
-            stuck = other is None
         else:
             self._trail.add(pose)
             if not self.needs_plan(pose, now):
                 self._shorten(pose, now)
                 return False
-            other = self.planner.plan(pose, self.last, now, self._away <= MAX_PLAN_DISTANCE and not self._waits(now))
-            # What it got here before did not help it.
-            stuck = self._waits(now) and self._away <= MAX_PLAN_DISTANCE and (other is None or self._replanned)
-        self._replanned = self._waits(now) and self._away <= MAX_PLAN_DISTANCE
+        near, waits = self._away <= MAX_PLAN_DISTANCE, self._waits(now)
+        other = self.planner.plan(pose, self.last, now, ahead=near and not waits and not self._pieces)
+        # Before it goes back, it is stuck also where the plan that it got here did not help it.
+        stuck = other is None if self._pieces else near and waits and (other is None or self._replanned)
+        self._replanned = near and waits
         if stuck and self._may_go_back(now):
             self._approached |= self._near_end
             self._pieces = self._pieces + 1 if self._back(pose, now) else 0
@@ -187,13 +186,12 @@ class Agent:
         if self._gone(pose) > min(MIN_HEADWAY[0], MIN_HEADWAY[1] * HEADWAY_TIME * self._bounds.speed):
             self._anchor, self.planner.got_on, self._replanned = pose[:2].copy(), now, False
         blocked = self.planner.is_blocked(now) and not self.passes
-        lost = (
-            blocked or self._away > MAX_PLAN_DISTANCE or self._waits(now)
-        ) and now - self.planner.tried > BLOCKED_RETRY
-        lost, self.planner.looked = lost and self.planner.looked, False
-        if lost:
+        needs = blocked or self._away > MAX_PLAN_DISTANCE or self._waits(now)
+        can = self.planner.looked and now - self.planner.tried > BLOCKED_RETRY
+        self.planner.looked = False
+        if needs and can:
             self.planner.tried = now
-        return lost
+        return needs and can
 
     def _waits(self, now: float) -> bool:
         """Tells whether it has hardly moved for a while."""
@@ -244,9 +242,8 @@ class Reactive(ABC):
     """A motion stage that asks for twists along a plan.
 
     It makes another plan when scans show that the plan is blocked and the twists do not pass (`passes`), or when the
-    robot is off its plan or waits.
-    Where a robot waits that can reverse, and another plan is not found or does not help, it goes back a little on its
-    `Trail`, and plans again.
+    robot is off its plan or waits. Where a robot waits that can reverse, and another plan is not found or does not
+    help, it goes back a little on its `Trail`, and plans again.
 
     Attributes:
         bounds: What twists each robot can drive.

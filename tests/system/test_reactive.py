@@ -216,7 +216,7 @@ def test_turned_at_goal(turned: float, plans: int, monkeypatch: pytest.MonkeyPat
     stage.assign([own])
     reference = np.hstack(own.reference.sample(np.zeros(1)))
     stage.reset(np.zeros((1, 3)), reference, 0.05)
-    monkeypatch.setattr(Planner, "plan", lambda *_: tries.append(None))
+    monkeypatch.setattr(Planner, "plan", lambda *_, ahead: tries.append(None))
     lidar, around, random = Lidar(), Surroundings(task.obstacles).at(0.0), np.random.default_rng(0)
     way = np.append(np.arange(0.0, 3.0, 0.05), np.full(50, 3.0))  # it stands for 2.5 s at the end
     for k, x in enumerate(way):
