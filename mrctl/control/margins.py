@@ -50,10 +50,12 @@ class Margins(NamedTuple):
     Attributes:
         crossover: Frequency in rad/s at which the loop gain passes through one; of several, that of the phase margin.
             It is NaN, as phase and delay, where there is none.
-        phase: Phase margin in degrees, the smallest of all such frequencies; negative if the loop is unstable.
+        phase: Phase margin in degrees, the least angle between L and −1 at all such frequencies; negative if the closed
+            loop is unstable.
         gain: Gain margin as a factor, the smallest of all frequencies at which the phase falls through an odd multiple
             of −180°; below one if the loop is unstable, and infinite if the phase never reaches −180°.
-        delay: Delay margin in s, the smallest of all crossovers.
+        delay: Delay margin in s, the least delay that turns L into −1 at one of the crossovers; if the closed loop is
+            unstable, the least delay whose removal does so, as a negative number.
         bandwidth: Frequency in rad/s at which the gain of the closed loop falls through 1/√2; NaN where it does not.
         sensitivity: M_s = max |S| with S = 1/(1 + L), the reciprocal of the least distance of L from −1.
     """
@@ -69,6 +71,9 @@ class Margins(NamedTuple):
 def margins(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
     """Margins of an open loop on a fine grid of frequencies.
 
+    The closed loop is unstable if the phase falls through an odd multiple of −180° more often than it rises through one
+    where the loop gain is above one (Nyquist's criterion for a stable open loop, which may integrate).
+
     Args:
         frequency: ω in rad/s, ascending, `(F,)`.
         loop: Frequency response of the open loop at these frequencies, `(F,)`.
@@ -76,26 +81,33 @@ def margins(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
     magnitude, phase = np.abs(loop), np.unwrap(np.angle(loop))
     phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))  # PI control starts between 0 and −180°
     crossover, phase_margin, delay, bandwidth = np.nan, np.nan, np.nan, np.nan
+    turns = (phase + np.pi) / (2 * np.pi)  # whole where L is negative
+    falls, rises = _inversions(magnitude, turns), _inversions(magnitude, -turns)
+    sign = -1.0 if (falls > 1).sum() > (rises > 1).sum() else 1.0
     above = magnitude > 1
     if (k := np.flatnonzero(above[:-1] != above[1:])).size:
         share = (1 - magnitude[k]) / (magnitude[k + 1] - magnitude[k])
-        crossovers, left = _between(frequency, k, share), np.pi + _between(phase, k, share)
-        crossover, phase_margin, delay = crossovers[left.argmin()], left.min(), (left / crossovers).min()
-    turns = (phase + np.pi) / (2 * np.pi)  # whole where L is negative
-    k = np.flatnonzero(np.floor(turns[1:]) < np.floor(turns[:-1]))
-    share = (np.floor(turns[k]) - turns[k]) / (turns[k + 1] - turns[k])
-    inverted = _between(magnitude, k, share)
+        crossovers, left = _between(frequency, k, share), 2 * np.pi * _between(turns, k, share)
+        distances = np.abs(left - 2 * np.pi * np.round(left / (2 * np.pi)))
+        crossover, phase_margin = crossovers[distances.argmin()], sign * distances.min()
+        delay = sign * (sign * left % (2 * np.pi) / crossovers).min()
     passed = np.abs(loop / (1 + loop)) < np.sqrt(0.5)
     if passed.any() and not passed[0]:
         bandwidth = frequency[int(np.argmax(passed))]
     return Margins(
         crossover=float(crossover),
         phase=float(np.degrees(phase_margin)),
-        gain=float((1 / inverted).min(initial=np.inf)),
+        gain=float((1 / falls).min(initial=np.inf)),
         delay=float(delay),
         bandwidth=float(bandwidth),
         sensitivity=float(np.abs(1 / (1 + loop)).max()),
     )
+
+
+def _inversions(magnitude: Array, turns: Array) -> Array:
+    """Returns the loop gains where L is negative and its phase falls; the number of turns, `(F,)`, is whole there."""
+    k = np.flatnonzero(np.floor(turns[1:]) < np.floor(turns[:-1]))
+    return _between(magnitude, k, (np.floor(turns[k]) - turns[k]) / (turns[k + 1] - turns[k]))
 
 
 def _between(values: Array, k: NDArray[np.intp], share: Array) -> Array:

@@ -201,6 +201,24 @@ def test_smallest_margins():
     assert found.gain == pytest.approx(0.04 * resonance / 10, rel=1e-3)  # at the resonance L is −10/(0.04 · 40)
 
 
+def test_margins_of_a_stable_resonance():
+    """Beyond −180° the margins count from −540°: with its delay margin added the closed loop has a pole on the axis."""
+    w = GRID
+    loop = 100 * np.exp(-0.25j * w) / (1j * w * (100 - w**2 + 0.2j * w))
+    found = margins(w, loop)
+    assert found.sensitivity < 1.5 and found.gain > 1
+    crossed = np.flatnonzero(np.diff(np.sign(np.abs(loop) - 1)))
+    angles = np.abs(np.degrees(np.angle(-loop[crossed])))
+    assert len(crossed) == 3
+    assert found.phase == pytest.approx(angles.min(), abs=0.1)
+    assert found.crossover == pytest.approx(w[crossed[angles.argmin()]], rel=1e-4)
+    # The least delay that moves a pole onto the axis: L(jω) e^(−jωT) = −1 at the last crossover.
+    assert found.delay == pytest.approx((np.angle(-loop[crossed]) % (2 * np.pi) / w[crossed]).min(), rel=1e-3)
+    brink, beyond = (margins(w, loop * np.exp(-1j * w * found.delay * factor)) for factor in (0.98, 1.02))
+    assert brink.phase > 0 > beyond.phase and brink.gain > 1 > beyond.gain
+    assert beyond.delay == pytest.approx(-0.02 * found.delay, rel=0.01)
+
+
 def test_no_margins():
     """A loop that is never above one has no crossover and no bandwidth to speak of, and its gain margin is infinite."""
     found = margins(GRID, 0.5 / (1 + 1j * GRID))
