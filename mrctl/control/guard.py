@@ -109,7 +109,7 @@ def guard(
     g.forget = False
     if not g.on:
         for k in range(2):
-            g.output[k], g.teaching[k] = feedforward[k], feedback[k]
+            g.output[k], g.teaching[k] = feedforward[k], g.gain * feedback[k]
         return
     broken, g.broken = g.broken, False
     for k in range(2):

@@ -98,12 +98,15 @@ def test_silent(inputs):
 
 
 def test_off():
-    """Switched off it passes on everything."""
+    """Switched off it passes on everything; the learner is taught with the share that the watch on the delay leaves."""
     bench = Bench(on=False)
     for values in ((100.0, -200.0), (np.nan, np.inf)):
         assert bench.tick(feedforward=values, feedback=(50, 60), error=9.0, slower=(9, 9)) == "none"
         np.testing.assert_array_equal(bench.g["output"], values)
         np.testing.assert_array_equal(bench.g["teaching"], (50, 60))
+    bench.g["gain"] = 1 / 3
+    bench.tick(feedback=(60, 30))
+    assert bench.g["teaching"] == pytest.approx([20, 10])
 
 
 @pytest.mark.parametrize(("rigid", "output"), [(False, (16.0, -8.0)), (True, (24.0, -3.0))])
