@@ -374,16 +374,17 @@ class Simulation:
         """Adds an event to every run; `scenarios` then contain it, and a new run of them gives the same bits.
 
         Args:
-            event: The event, not before the coming tick; if it has a reference, not before the voltage of that tick
-                acts.
+            event: The event, not before the coming tick, or the one after it once `sense` has applied its events; if
+                it has a reference, not before the voltage of that tick acts.
 
         Raises:
             InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
             ValueError: It has a reference, and the simulation was made with `restarting`.
         """
-        if event.tick(self.period) < self.tick:
-            raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
-        if event.reference is not None and event.tick(self.period) < self.tick + self.preview:
+        coming = self.tick + self._sensed
+        if event.tick(self.period) < coming:
+            raise InputError(f"time: {event.time:g} s has passed, the next tick is at {coming * self.period:g} s")
+        if event.reference is not None and event.tick(self.period) < coming + self.preview:
             raise InputError(f"time: a reference must be known {self.preview * self.period:g} s before it begins")
         self._check_gains(event)
         if event.perturbation is not None:

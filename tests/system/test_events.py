@@ -83,6 +83,23 @@ def test_added_in_the_same_tick():
     assert first_difference(live.result().isel(run=0), again) == again.sizes["time"]
 
 
+def test_added_after_sensing():
+    """An event for a tick whose events have been applied is refused; one for the next tick acts as in a new run."""
+    live = Simulation([BASE])
+    live.step()
+    live.sense()
+    with pytest.raises(InputError, match=r"time: 0\.01 s has passed, the next tick is at 0\.02 s"):
+        live.add(Event(time=0.01, perturbation=PAYLOAD))
+    with pytest.raises(InputError, match="has passed"):
+        live.add(Event(time=0.01, reference=BASE.reference))
+    assert live.scenarios == Simulation([BASE]).scenarios
+    live.add(Event(time=0.02, perturbation=PAYLOAD))
+    while live.running:
+        live.step()
+    again = simulate(live.scenarios[0])
+    assert first_difference(live.result().isel(run=0), again) == again.sizes["time"]
+
+
 @pytest.mark.parametrize("size", [1, 2])
 def test_payload_is_taken_off_again(size):
     """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the prior."""
