@@ -66,7 +66,8 @@ class Event(Record):
     perturbation: Perturbation | None = None
     """Perturbation of the plant from then on, which replaces the previous one."""
     push: tuple[float, float, float] | None = None
-    """Push on the chassis: forces along the world's x and y in N, and a torque about z in N·m."""
+    """Push on the chassis: forces along the world's x and y in N, and a torque about z in N·m; pushes that overlap add
+    up."""
     push_duration: Annotated[float, Field(gt=0, le=10)] = 0.1
     """Duration of the push in s."""
     reference: Reference | None = None

@@ -206,7 +206,9 @@ class Plant(ABC):
         # Long enough for the largest possible delays of sensing and perturbation, because those may change.
         self._queue = np.zeros((1 + round(2 * MAX_DELAY / self._period), size, 4))
         self._tick = 0
-        self._pushes: dict[int, int] = {}
+        self._pushes: dict[
+            int, list[tuple[int, Array]]
+        ] = {}  # of each robot: the ticks at which they end, and wrenches
         self._chassis = model.body("chassis").id
         self._collision = model.sensor(COLLISION).adr[0] if has(model, "sensor", COLLISION) else -1
         self._began = np.zeros(size, int)  # tick at which each robot was placed on the ground
@@ -329,15 +331,24 @@ class Plant(ABC):
         """Returns the compiled model of one robot, for `stand`."""
 
     def push(self, robot: int, force: Array, periods: int) -> None:
-        """Pushes the chassis of one robot.
+        """Pushes the chassis of one robot; pushes that overlap add up.
 
         Args:
             robot: Index of the robot.
             force: Forces along the world's x and y in N at the chassis' centre of mass, torque about z in N·m, `(3,)`.
             periods: Duration in control periods.
         """
-        self.wrench[robot, self._chassis] = force[0], force[1], 0.0, 0.0, 0.0, force[2]
-        self._pushes[robot] = self._tick + periods
+        wrench = np.array([force[0], force[1], 0.0, 0.0, 0.0, force[2]])
+        self._pushes.setdefault(robot, []).append((self._tick + periods, wrench))
+        self._press(robot)
+
+    def _press(self, robot: int) -> None:
+        """Applies the sum of the pushes on one robot that have not ended."""
+        lasting = [(end, wrench) for end, wrench in self._pushes.pop(robot) if end > self._tick]
+        self.wrench[robot, self._chassis] = 0.0
+        if lasting:
+            self._pushes[robot] = lasting
+            self.wrench[robot, self._chassis] = sum((wrench for _, wrench in lasting[1:]), start=lasting[0][1])
 
     def step(self, command: Array, faults: Mapping[int, str] | None = None) -> None:
         """Holds a command for one control period: `send`, `advance`, `look`."""
@@ -384,10 +395,8 @@ class Plant(ABC):
     def look(self) -> None:
         """Updates the readouts after the physics; fails robots that have tilted or whose state is not finite."""
         self._tick += 1
-        if self._pushes:
-            for robot in [r for r, end in self._pushes.items() if end == self._tick]:
-                self.wrench[robot, self._chassis] = 0.0
-                del self._pushes[robot]
+        for robot in list(self._pushes):
+            self._press(robot)
         if not self._look(0, self.size, self._period, self._held.place):
             upright = self.reading["upright"]
             for robot in np.flatnonzero(~(upright > MIN_COS_TILT)):

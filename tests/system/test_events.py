@@ -156,6 +156,32 @@ def test_push():
     assert sideways.y[120] > 1e-3 + sideways.y[100]
 
 
+def test_overlapping_pushes():
+    """Two pushes at a time, also added while the run goes on, are the push of their sum, and a restart ends both."""
+    line = Scenario(**IDEAL, reference=Line(speed=0.5, length=0.25), laps=1, learner="none", initial_spread=(0, 0, 0))
+    first, second = (
+        Event(time=t, push=force, push_duration=0.1) for t, force in ((0.1, (20, 0, 0)), (0.15, (0, 9, 0)))
+    )
+    parts = ((0.1, (20, 0, 0)), (0.15, (20, 9, 0)), (0.2, (0, 9, 0)))
+    whole = [Event(time=t, push=force, push_duration=0.05) for t, force in parts]
+    both, summed = simulate(with_events(first, second, base=line)), simulate(with_events(*whole, base=line))
+    assert first_difference(both, summed) == both.sizes["time"]
+    live = Simulation([line])
+    live.add(second)
+    live.step()
+    live.add(first)
+    while live.running:
+        live.step()
+    assert first_difference(live.result().isel(run=0), both) == both.sizes["time"]
+    again = Simulation([with_events(first, second, base=line)], restarting=True)
+    for _ in range(17):
+        again.step()
+    assert again.plant.wrench.any()
+    again.restart(0, line)
+    again.step()
+    assert not again.plant.wrench.any()
+
+
 def test_delay():
     """Alone and in a batch: what reaches the motors is the command of d ticks before, from the tick of the event on."""
     scenario = with_events(Event(time=0.5, perturbation=Perturbation(control_delay=0.03)))

@@ -219,18 +219,19 @@ def test_push():
         assert plant.reading["twist"][row, 1] - turning == pytest.approx(4 * 0.02 / ROBOT.effective_inertia, rel=0.15)
 
 
-def test_second_push():
-    """A new push replaces the old one and its end."""
+def test_overlapping_pushes():
+    """Pushes add up while each lasts, in whatever order they end."""
     for plant in plants():
-        plant.push(0, np.array([10.0, 0, 0]), 5)
+        chassis = plant.wrench[0, MODEL.body("chassis").id]
+        plant.push(0, np.array([10.0, 0, 0]), 4)
         plant.step(volts(plant, 0.0))
         plant.push(0, np.array([0.0, 7.0, 1.0]), 2)
-        chassis = plant.wrench[0, MODEL.body("chassis").id]
-        assert list(chassis) == [0, 7, 0, 0, 0, 1]
-        plant.step(volts(plant, 0.0))
-        assert chassis.any()
-        plant.step(volts(plant, 0.0))
-        assert not chassis.any()
+        plant.push(0, np.array([2.0, 0.0, 0.0]), 5)
+        felt = []
+        for _ in range(6):
+            felt.append(chassis.tolist())
+            plant.step(volts(plant, 0.0))
+        assert felt == [[12, 7, 0, 0, 0, 1]] * 2 + [[12, 0, 0, 0, 0, 0]] + [[2, 0, 0, 0, 0, 0]] * 2 + [[0] * 6]
 
 
 @pytest.mark.parametrize("command", [np.nan, np.inf, -np.inf])
