@@ -36,7 +36,8 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
 
     Args:
         model: Compiled model.
-        drive_gain: Applied volts per commanded volt; a model does not hold this number.
+        drive_gain: Applied volts per commanded volt. A model holds only the range of the applied volts, which `perturb`
+            widens by a gain above one.
         scratch: As for `at_rest`.
 
     Raises:
@@ -90,7 +91,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
         "rolling_coefficient": rolling,
         "wheel_inertia": _spin_inertia(model, "wheel_left"),
         "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in front_wheels),
-        "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1],
+        "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1] / max(1.0, drive_gain),
         "drive_gain": drive_gain,
         "tyre_friction": model.pair_friction[left_tyre_pairs(model)[0], 0],
         "max_speed": limits[0],

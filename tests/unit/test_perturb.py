@@ -249,10 +249,12 @@ def test_known_robot(monkeypatch):
 
 
 def test_supply():
-    """A stronger supply raises the motors' voltage range; a weaker one leaves it."""
+    """A stronger supply raises the motors' voltage range; a weaker one leaves it. The range of commands stays."""
     assert read_robot(NOMINAL, 0.8).drive_gain == 0.8
-    assert read_robot(perturbed(supply_factor=0.8)).supply == 24
-    assert read_robot(perturbed(supply_factor=1.25)).supply == pytest.approx(30)
+    for factor, volts in ((0.8, 24), (1.25, 30)):
+        model = perturbed(supply_factor=factor)
+        assert read_robot(model).supply == pytest.approx(volts)
+        assert read_robot(model, factor).supply == pytest.approx(24)
 
 
 FIELDS = {
