@@ -80,7 +80,7 @@ class Event(Record):
     oscillations have added. With `retune` off or a `time_constant` the PID is designed without that delay, and the
     motion controller stays as slow as it is. Refused where a user's stage takes the place of the PID."""
     learning: bool | None = None
-    """Whether the feedforward learns from then on."""
+    """Whether the feedforward learns from then on; `observer`, `indi` and `l1`, which do not learn, go on."""
 
     @model_validator(mode="after")
     def _changes(self) -> Event:
@@ -164,8 +164,8 @@ class Scenario(Record):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """This seed determines initial offset and weights, and noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=10)] | None = None
-    """Time constant in s of the filter on the velocities that the motion controller adds to the reference; by default
-    it is designed with the gains of the motion controller."""
+    """Time constant in s of the filter on the velocities that the motion controller adds to the reference, in effect at
+    least the control period; by default designed with the gains."""
     physics_step: Annotated[float, Field(ge=1e-5, le=0.01)] = 0.002
     """Duration of one physics step in s."""
     control_period: Annotated[float, Field(ge=1e-3, le=0.1)] = 0.01

@@ -192,7 +192,7 @@ def motion(
         gains: PI gains of both channels.
         delay: Delay from measurement to voltage in s.
         period: Control period in s.
-        prefilter: Time constant of the prefilter in s, if it is given.
+        prefilter: Time constant of the prefilter in s, if it is given; it is at least the control period.
     """
     return _motion(robot, rigid, gains, delay, period, prefilter)
 
