@@ -23,7 +23,7 @@ from mrctl.physics.elements import (
 )
 from mrctl.physics.units import mistake, too_long
 from mrctl.record import InputError
-from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
+from mrctl.theory.robot import ANY_ANGLE, Robot
 
 
 def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.MjData | None = None) -> Robot:
@@ -41,9 +41,11 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
         scratch: As for `at_rest`.
 
     Raises:
-        InputError: A parameter is out of range, the centre of mass lies outside the wheels, or a rear wheel's
-            frictionloss is smaller than its rolling and no-load losses.
+        InputError: A parameter is out of range, there is no gravity, the centre of mass lies outside the wheels, or a
+            rear wheel's frictionloss is smaller than its rolling and no-load losses.
     """
+    if gravity(model) == 0:
+        raise InputError("gravity: is zero, so that the wheels bear no load")
     data, com = at_rest(model, scratch)
     bodies = bodies_of(model)
     masses, positions = model.body_mass[bodies], data.xipos[bodies, :2]
@@ -94,6 +96,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
         "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1] / max(1.0, drive_gain),
         "drive_gain": drive_gain,
         "tyre_friction": model.pair_friction[left_tyre_pairs(model)[0], 0],
+        "gravity": gravity(model),
         "max_speed": limits[0],
         "max_rotation": limits[1],
         "max_acceleration": limits[2],
@@ -127,6 +130,11 @@ def at_rest(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> tupl
     bodies, chassis = bodies_of(model), data.body("chassis")
     com = np.average(data.xipos[bodies], axis=0, weights=model.body_mass[bodies])
     return data, chassis.xmat.reshape(3, 3).T @ (com - chassis.xpos)
+
+
+def gravity(model: mujoco.MjModel) -> float:
+    """Returns the gravitational acceleration in m/s²; rounded, because a slope turns its vector."""
+    return float(np.round(np.linalg.norm(model.opt.gravity), 12))
 
 
 def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, float]:
@@ -181,7 +189,7 @@ def load_torques(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) ->
     front, side = com[0] / (wheelbase - trail), com[1] / (2 * half_track)
     shares = {"wheel_left": (1 - front) / 2 + side, "wheel_right": (1 - front) / 2 - side}
     shares |= {wheel: front / len(fronts(model)) for wheel in fronts(model)}
-    weight = GRAVITY * model.body_mass[bodies_of(model)].sum()
+    weight = gravity(model) * model.body_mass[bodies_of(model)].sum()
     return {wheel: float(weight * share * model.geom(wheel).size[0]) for wheel, share in shares.items()}
 
 

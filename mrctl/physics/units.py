@@ -21,7 +21,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.physics.elements import REAR, bodies_of, fronts, part, rolling_fronts
 from mrctl.record import InputError
-from mrctl.theory.robot import ANY_ANGLE, GRAVITY, LIMITS, Robot
+from mrctl.theory.robot import ANY_ANGLE, LIMITS, Robot
 
 RPM_PER_RAD_S = 30 / math.pi
 """Rate of one radian per second in rpm."""
@@ -77,7 +77,7 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
     a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across.
     """
-    grip = robot.tyre_friction * GRAVITY
+    grip = robot.tyre_friction * robot.gravity
     speed = 0.64 * robot.velocity_gain * robot.supply
     rotation = min(0.4 * speed / robot.half_track, 0.5 * grip / speed)
     if robot.steering_limit < ANY_ANGLE:

@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 
 from mrctl.kernel import Array
 from mrctl.record import InputError, Record
-from mrctl.theory.robot import GRAVITY, Robot
+from mrctl.theory.robot import Robot
 from mrctl.theory.spline import Plane, Spline, plane, spline
 from mrctl.theory.timing import LIMIT_SHARE, Limits, SmoothLaw, sample_path, smooth
 
@@ -525,7 +525,13 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
         ("acceleration", v_dot, "m/s²", "max_acceleration", robot.max_acceleration),
         ("rotation acceleration", omega_dot, "rad/s²", "max_rotation_acceleration", robot.max_rotation_acceleration),
         ("steering angle", steering, "rad", "steering_limit", robot.steering_limit),
-        ("lateral acceleration", v * omega, "m/s²", "tyre_friction times gravity,", robot.tyre_friction * GRAVITY),
+        (
+            "lateral acceleration",
+            v * omega,
+            "m/s²",
+            "tyre_friction times gravity,",
+            robot.tyre_friction * robot.gravity,
+        ),
     ):
         worst = int(np.argmax(np.abs(values)))
         if not (peak := abs(values[worst])) <= bound * (1 + 1e-9):  # NaN is refused, too

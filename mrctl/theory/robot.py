@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from mrctl.record import Record
 
-GRAVITY = 9.81  # m/s²
+GRAVITY = 9.81  # m/s², on Earth
 ANY_ANGLE = math.pi / 2  # rad, the steering limit of a robot without a steered wheel
 LIMITS = "max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration"  # fields of `Robot`
 Steering = Literal["compliant", "caster", "rigid"]
@@ -83,6 +83,8 @@ class Robot(Record):
     """Ratio of applied to commanded voltage; below 1 for a PWM drive on a sagging supply."""
     tyre_friction: Positive
     """Coulomb friction coefficient between tyre and floor."""
+    gravity: Positive = GRAVITY
+    """Gravitational acceleration [g] in m/s², of the world that the robot drives in."""
     max_speed: Positive
     """Limit on |V| for references and commands in m/s."""
     max_rotation: Positive
@@ -125,7 +127,7 @@ class Robot(Record):
     @property
     def rolling_force(self) -> float:
         """Rolling resistance of all wheels on level ground, F_roll, in N."""
-        return self.rolling_coefficient * self.mass * GRAVITY
+        return self.rolling_coefficient * self.mass * self.gravity
 
     @property
     def front_load(self) -> float:

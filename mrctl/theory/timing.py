@@ -34,7 +34,7 @@ from pydantic import Field, model_validator
 from mrctl.kernel import Array, kernel
 from mrctl.record import InputError, Record
 from mrctl.theory.dynamics import inverse_coefficients
-from mrctl.theory.robot import GRAVITY, Robot
+from mrctl.theory.robot import Robot
 
 LIMIT_SHARE = 0.9
 """Share of the robot's limits that a reference may use; the rest is for the feedback. Chosen."""
@@ -86,7 +86,7 @@ class Limits(Record):
             acceleration=reserve * robot.max_acceleration,
             rotation=reserve * robot.max_rotation,
             rotation_acceleration=reserve * robot.max_rotation_acceleration,
-            lateral_acceleration=reserve * robot.tyre_friction * GRAVITY,
+            lateral_acceleration=reserve * robot.tyre_friction * robot.gravity,
             voltage=reserve * robot.supply,
             inverse=tuple((float(common), float(other)) for common, other in inverse_coefficients(robot)),
         )

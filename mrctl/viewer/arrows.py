@@ -13,7 +13,7 @@ import viser
 
 from mrctl.kernel import Array
 from mrctl.physics.contacts import NO_CONTACTS, Contacts
-from mrctl.theory.robot import GRAVITY, Robot
+from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour
 from mrctl.viewer.robots import Robots, name_of
 
@@ -30,7 +30,7 @@ class Arrows:
     def __init__(self, scene: viser.SceneApi, robots: Robots, robot: Robot) -> None:
         """Takes the scene, the robots in it, and the parameters of the nominal robot."""
         self._scene, self._robots = scene, robots
-        self._mass, self._max_speed = robot.mass, robot.max_speed
+        self._mass, self._weight, self._max_speed = robot.mass, robot.mass * robot.gravity, robot.max_speed
         self._forces: list[viser.ArrowsHandle | None] = [None] * robots.size
         self._touches: list[list[viser.ArrowsHandle]] = []  # of each robot: forces and slips
 
@@ -67,7 +67,7 @@ class Arrows:
             turn = np.empty(9)
             mujoco.mju_quat2Mat(turn, self._robots.quaternions[row])
             places = (touch.places - self._robots.positions[row]) @ turn.reshape(3, 3)
-            lengths = touch.forces / (self._mass * GRAVITY), touch.slips / (SLIP_OF_LENGTH * self._max_speed)
+            lengths = touch.forces / self._weight, touch.slips / (SLIP_OF_LENGTH * self._max_speed)
             for drawn, ways in zip(arrows, lengths, strict=True):
                 seen = np.linalg.norm(ways, axis=1) > MIN_ARROW
                 drawn.visible = bool(seen.any())

@@ -11,8 +11,11 @@ from mrctl.physics import mjcf
 from mrctl.physics.files import models_folder
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
+from mrctl.record import InputError
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Circle, check
 from mrctl.theory.robot import RobotFile
+from mrctl.theory.timing import Limits
 
 NOMINAL = mjcf.load()
 BASE = read_robot(NOMINAL)
@@ -114,6 +117,28 @@ def test_steering_of_the_arrangements():
     assert rigid.fork_moment == pytest.approx(0.005) and caster.fork_moment == BASE.fork_moment
     turtlebot = mjcf.build(steering="caster", robot=RobotFile(path="turtlebot"))[1]
     assert (turtlebot.steering_stiffness, turtlebot.fork_inertia, turtlebot.fork_moment) == (0, 0, 0)
+
+
+def test_gravity(tmp_path):
+    """The robot has the gravity of its world; its friction torques are those of the file, and a slope changes none."""
+    folder = shutil.copytree(models_folder(), tmp_path / "models")
+    text = (folder / "flat.xml").read_text()
+    assert text.count('<include file="car.xml"/>') == 1
+    include = '<include file="car.xml"/><option gravity="0 0 {}"/>'
+    for name, value in (("moon", -1.62), ("nowhere", 0)):
+        (folder / f"{name}.xml").write_text(text.replace('<include file="car.xml"/>', include.format(value)))
+    model, robot = mjcf.build(str(folder / "moon.xml"))
+    assert (BASE.gravity, robot.gravity) == (9.81, 1.62)
+    assert robot.rolling_force == pytest.approx(BASE.rolling_force)
+    assert robot.gear_loss == pytest.approx(BASE.gear_loss)
+    assert Limits.of(robot).lateral_acceleration == pytest.approx(0.9 * robot.tyre_friction * 1.62)
+    with pytest.raises(InputError, match=r"lateral acceleration 2.08 m/s² .* 1.46 m/s²"):
+        check(Circle(radius=0.8, period=3.9), robot, reverse=False)
+    with pytest.raises(InputError, match="gravity: is zero"):
+        mjcf.build(str(folder / "nowhere.xml"))
+    sloped = mjcf.clone(model)
+    perturb(model, sloped, Perturbation(slope=0.3))
+    assert read_robot(sloped).gravity == 1.62
 
 
 def test_inductance(tmp_path):
