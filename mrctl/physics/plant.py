@@ -206,9 +206,7 @@ class Plant(ABC):
         # Long enough for the largest possible delays of sensing and perturbation, because those may change.
         self._queue = np.zeros((1 + round(2 * MAX_DELAY / self._period), size, 4))
         self._tick = 0
-        self._pushes: dict[
-            int, list[tuple[int, Array]]
-        ] = {}  # of each robot: the ticks at which they end, and wrenches
+        self._pushes: dict[int, list[tuple[int, Array]]] = {}  # wrenches on each robot, and the ticks at which they end
         self._chassis = model.body("chassis").id
         self._collision = model.sensor(COLLISION).adr[0] if has(model, "sensor", COLLISION) else -1
         self._began = np.zeros(size, int)  # tick at which each robot was placed on the ground

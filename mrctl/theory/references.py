@@ -519,19 +519,14 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
         return f"reverses at t = {when:.2f} s, which compliant and caster steering cannot do; use rigid"
     # atan2 depends on θ̇/V alone as the robot comes to rest, and is zero at rest, which needs no steering angle.
     steering = np.arctan2(abs(robot.wheelbase) * np.abs(omega), np.abs(v))
+    grip = robot.tyre_friction * robot.gravity
     for name, values, unit, limit, bound in (
         ("speed", v, "m/s", "max_speed", robot.max_speed),
         ("rotation", omega, "rad/s", "max_rotation", robot.max_rotation),
         ("acceleration", v_dot, "m/s²", "max_acceleration", robot.max_acceleration),
         ("rotation acceleration", omega_dot, "rad/s²", "max_rotation_acceleration", robot.max_rotation_acceleration),
         ("steering angle", steering, "rad", "steering_limit", robot.steering_limit),
-        (
-            "lateral acceleration",
-            v * omega,
-            "m/s²",
-            "tyre_friction times gravity,",
-            robot.tyre_friction * robot.gravity,
-        ),
+        ("lateral acceleration", v * omega, "m/s²", "tyre_friction times gravity,", grip),
     ):
         worst = int(np.argmax(np.abs(values)))
         if not (peak := abs(values[worst])) <= bound * (1 + 1e-9):  # NaN is refused, too
