@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array, Row, Rows, kernel
-from mrctl.sensing.prediction import front, predict, wrapped
+from mrctl.sensing.prediction import predict, wrapped
 
 N = 11  # number of states
 X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
@@ -433,7 +433,7 @@ def ekf(
     tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
     """The estimator `ekf`; the arguments are those of `truth`, and `true` is not read."""
-    f, now = memory, front(tick, sensor)
+    f, now = memory, tick - s.age
     taken = tick - sensor.fix_latency  # when the fix that arrives now was taken
     if s.start <= taken < now and ring[taken % len(ring), i].fix_arrives:
         for k in range(MAX_STORED):

@@ -24,7 +24,7 @@ from mrctl.sensing.ekf import (
     ekf,
 )
 from mrctl.sensing.localisation import Localiser
-from mrctl.sensing.prediction import SEEN, front, predict, wrapped
+from mrctl.sensing.prediction import SEEN, predict, wrapped
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors, command_all, sample_all
 from mrctl.sensing.slip import slip_ratio
@@ -85,8 +85,7 @@ def odometry(
 
     The heading in the middle of the period is the direction of Δs. The arguments are those of `truth`.
     """
-    now = front(tick, sensor)
-    m = memory.mean
+    now, m = tick - s.age, memory.mean
     if now > s.start:
         this, last = ring[now % len(ring), i], ring[(now - 1) % len(ring), i]
         way = geometry.wheel_radius * (this.encoder[0] - last.encoder[0] + this.encoder[1] - last.encoder[1]) / 2
@@ -256,6 +255,7 @@ class Estimator:
         random, seen = np.random.default_rng([seed, 3]), self.seen[row]
         self.seen[row], self.memory[row] = np.zeros((), SEEN), np.zeros((), self.memory.dtype)
         seen["start"], seen["delay"] = tick, sensing.periods("delay", period)
+        seen["age"] = sensing.latency(self._name, period)
         deviation = np.zeros(5)
         if self._name != "truth":
             position, heading = sensing["start_position_noise"], sensing["start_heading_noise"]

@@ -20,6 +20,7 @@ SEEN = np.dtype(
         ("variance", "f8", 6),  # of `estimate`: var x, cov (x, y), var y, var θ, var V, var θ̇; 0 where it is not known
         ("fix", "f8", 3),  # posture fix that arrived in this tick, m, m, rad; NaN where none did
         ("delay", "i8"),  # control periods from the measurement to the voltage
+        ("age", "i8"),  # control periods by which the samples are old from which the estimate is made
         ("start", "i8"),  # tick at which the run of this robot began
     ],
     align=True,
@@ -83,9 +84,3 @@ def predict(state: Array, first: int, last: int, ring: Rows, i: int, period: flo
 def wrapped(angle: float) -> float:
     """Returns an angle in rad in (−π, π]."""
     return np.pi - (np.pi - angle) % (2 * np.pi)
-
-
-@kernel
-def front(tick: int, sensor: Row) -> int:
-    """Returns the last tick of which all samples of encoders, gyro and accelerometer have arrived."""
-    return tick - max(sensor.encoder_latency, sensor.gyro_latency, sensor.accelerometer_latency)

@@ -67,7 +67,13 @@ TIER_VALUES: dict[str, tuple[float, float, float]] = {
 START = {"start_position_noise": "fix_position_noise", "start_heading_noise": "fix_heading_noise"}
 """Fields whose default is the value of another field."""
 
-LATENCIES = "encoder_latency", "gyro_latency", "accelerometer_latency"
+AWAITED: dict[str, tuple[str, ...]] = {
+    "truth": (),
+    "odometry": ("encoder", "gyro"),
+    "ekf": ("encoder", "gyro", "accelerometer"),
+    "user": ("encoder", "gyro", "accelerometer"),
+}
+"""Sensors for whose samples each estimator waits; `user` stands for a user's, which may use all of them."""
 
 LOCALISED: dict[str, dict[str, float]] = {
     "scan": {"fix_position_noise": 0.01, "fix_heading_noise": 0.005, "fix_lost": 0, "fix_outliers": 0},
@@ -209,17 +215,24 @@ class Sensing(Record):
             raise ValueError(f"sensing.{name}: {wrong}")
         return count
 
+    def latency(self, estimator: str, control_period: float) -> int:
+        """Returns the latency of the slowest sensor for which an estimator waits, in control periods.
+
+        Args:
+            estimator: A key of `AWAITED`.
+            control_period: Control period in s.
+        """
+        return max((self.periods(f"{name}_latency", control_period) for name in AWAITED[estimator]), default=0)
+
     def loop_delay(self, control_period: float) -> int:
         """Returns the delay of the loop for which controllers are designed, in control periods.
 
-        It is `delay` and, where an estimator waits for the samples of encoders, gyro and accelerometer, the latency of
-        the slowest of them.
+        It is `delay` and the age of the samples from which the estimate is made.
 
         Args:
             control_period: Control period in s.
         """
-        late = 0 if self.source == "truth" else max(self.periods(name, control_period) for name in LATENCIES)
-        return self.periods("delay", control_period) + late
+        return self.periods("delay", control_period) + self.latency(self.source, control_period)
 
     def check(self, control_period: float, duration: float) -> None:
         """Refuses rates and latencies that do not fit a run.
@@ -245,7 +258,8 @@ class Sensing(Record):
             if name.endswith(("_rate", "_latency")) or name == "delay":
                 self.periods(name, control_period)
         latency = self.periods("fix_latency", control_period)
-        for name in ("encoder_latency", "gyro_latency"):  # a fix from a scan also needs the way since the last one
+        for sensor in AWAITED["odometry"]:  # a fix from a scan also needs the way since the last one
+            name = f"{sensor}_latency"
             if self.localisation != "fixes" and latency < self.periods(name, control_period):
                 raise ValueError(f"sensing.fix_latency: with a lidar it must be at least {name}, {self[name]:g} s")
         if latency > MAX_FIXES_IN_FLIGHT * self.periods("fix_rate", control_period):

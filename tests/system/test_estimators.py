@@ -413,6 +413,14 @@ def test_slow_inertial_sensors(slow):
     assert np.all(still < 1.1 * off.max()) and not held.failed.any()
 
 
+def test_odometry_needs_no_accelerometer():
+    """Odometry does not wait for a sensor that it does not use, nor are its controllers designed for one."""
+    late = LANE.sensing.model_copy(update={"accelerometer_latency": 0.1})
+    prompt, found = simulate(LANE), simulate(LANE.replace(sensing=late))
+    unlike = {name for name in SIGNALS if not np.array_equal(found[name], prompt[name], equal_nan=True)}
+    assert unlike == {"acceleration_x", "acceleration_y"} and np.array_equal(found.k_p, prompt.k_p)
+
+
 def test_own_odometry():
     """Odometry written by a user gives the bits of the built-in one, alone and in a batch."""
     builtin = simulate(LANES)
