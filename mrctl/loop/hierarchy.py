@@ -168,11 +168,10 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
     return finite, asks
 
 
-def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
-    """Returns the learner that a uniform group of scenarios names."""
-    first, period = scenarios[0], scenarios[0].control_period
-    delay, seeds = first.sensing.loop_delay(period), [s.seed for s in scenarios]
-    loop = Loop(robot, first.steering == "rigid", period, delay, first.prior != "none", seeds)
+def learner_of(scenarios: Sequence[Scenario], robot: Robot, delay: int) -> Learner:
+    """Returns the learner that a uniform group of scenarios names; `delay` is that of the loop in control periods."""
+    first, seeds = scenarios[0], [s.seed for s in scenarios]
+    loop = Loop(robot, first.steering == "rigid", first.control_period, delay, first.prior != "none", seeds)
     return LEARNERS[first.learner](loop, [getattr(s, s.learner, None) for s in scenarios])
 
 
@@ -201,7 +200,8 @@ class Hierarchy:
     """Both controllers for the B robots of a uniform group (`simulation.group_of`).
 
     Attributes:
-        stages: The user's stages by name, which `UserHierarchy` calls in place of the built-in ones.
+        stages: The user's stages by name, which `UserHierarchy` calls in place of the built-in ones, and the user's
+            estimator, for whose latency the controllers are designed.
         learner: The learner, or a user's feedforward in its place.
         prior: The prior of the feedforward, whose output is added to that of the learner.
         settings: Settings and design of each robot.
@@ -250,15 +250,16 @@ class Hierarchy:
         self.model = Prior([robot] * size, self.rigid)
         self.prior = Prior([None if first.prior == "none" else robot] * size, self.rigid)  # `set_truth` follows
         self._knows_truth = first.prior == "true_model"
-        delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
+        estimator = "user" if "estimator" in self.stages else None
+        delays = [s.sensing.loop_delay(self.period, estimator) for s in scenarios]
         if own := self.stages.get("feedforward"):
-            self.learner = UserFeedforward(own, self.prior, self.rigid, self.period, delays[0])
+            self.learner = UserFeedforward(own, self.prior, self.rigid, self.period, delays[0] * self.period)
             load = self.learner.load
         else:
-            self.learner, load = learner_of(scenarios, robot), load_learned
+            self.learner, load = learner_of(scenarios, robot, delays[0]), load_learned
             self.learner.prior = self.prior
         self.settings = [
-            Settings(s.pid, s.kanayama, s.prefilter, delay, load(s) if s.learned else None)
+            Settings(s.pid, s.kanayama, s.prefilter, delay * self.period, load(s) if s.learned else None)
             for s, delay in zip(scenarios, delays, strict=True)
         ]
         self._adopt(range(size))
@@ -394,7 +395,7 @@ class Hierarchy:
             row: Index of the robot.
             scenario: A scenario that fits the group.
         """
-        renewed = Hierarchy([scenario], self.robot)
+        renewed = Hierarchy([scenario], self.robot, self.stages)
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
         self.settings[row] = renewed.settings[0]

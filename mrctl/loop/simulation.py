@@ -233,7 +233,8 @@ def group_of(s: Scenario) -> Hashable:
     """Returns what the runs of one simulation must share; runs with goals end one by one, and may differ in length."""
     rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
     sensing, period = s.sensing, s.control_period
-    chain = sensing.source, sensing.periods("delay", period), sensing.loop_delay(period)
+    delays = [sensing.loop_delay(period, estimator) for estimator in (None, "user")]  # a user's may replace `source`
+    chain = sensing.source, sensing.periods("delay", period), *delays
     laws = s.prior, s.learner, s.fel.hidden
     return s.world, walls.layout(s.obstacles), s.robot, s.steering, *laws, *rates, *chain
 
@@ -285,17 +286,17 @@ class Simulation:
         self._check_references(robot)
         factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
         users = {name: UserStage(name, factory, robot, size) for name, factory in factories.items()}
-        own_estimator, self._stages = users.pop("estimator", None), named_stages(stages)
+        self._stages = named_stages(stages)
 
         self.preview = first.sensing.periods("delay", self.period)
         self.courses = (RestartingCourses if restarting else Courses)(scenarios, self.preview)
         self.plant = self._build_plant(models, robot, worthwhile(threads, size))
-        self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
+        self.hierarchy = (UserHierarchy if users.keys() - {"estimator"} else Hierarchy)(scenarios, robot, users)
         for event in (event for scenario in scenarios for event in scenario.events):
             self._check_gains(event)
         self.hierarchy.scanner = self._build_scanner()
         self.sensors = Sensors([s.sensing for s in scenarios], [s.seed for s in scenarios], self.period)
-        self.estimator = self._build_estimator(own_estimator)
+        self.estimator = self._build_estimator(users.get("estimator"))
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
         self.log = Log(1 if restarting else self.ticks, size, self.hierarchy.rigid)
         self.goals = Goals(scenarios, timed=not restarting)

@@ -224,15 +224,16 @@ class Sensing(Record):
         """
         return max((self.periods(f"{name}_latency", control_period) for name in AWAITED[estimator]), default=0)
 
-    def loop_delay(self, control_period: float) -> int:
+    def loop_delay(self, control_period: float, estimator: str | None = None) -> int:
         """Returns the delay of the loop for which controllers are designed, in control periods.
 
         It is `delay` and the age of the samples from which the estimate is made.
 
         Args:
             control_period: Control period in s.
+            estimator: A key of `AWAITED`; by default `source`, which a user's estimator replaces.
         """
-        return self.periods("delay", control_period) + self.latency(self.source, control_period)
+        return self.periods("delay", control_period) + self.latency(estimator or self.source, control_period)
 
     def check(self, control_period: float, duration: float) -> None:
         """Refuses rates and latencies that do not fit a run.
