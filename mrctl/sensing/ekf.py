@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array, Row, Rows, kernel
-from mrctl.sensing.prediction import predict, wrapped
+from mrctl.sensing.prediction import predict, settle, wrapped
 
 N = 11  # number of states
 X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
@@ -460,6 +460,7 @@ def ekf(
                     absorb_fix(sample.fix, f)
             else:
                 keep(now, f)
+    settle(f.mean, now, ring, i)
     predict(f.mean, max(now, s.start), tick, ring, i, period, s)
     s.estimate[0], s.estimate[1], s.estimate[2] = s.pose[0], s.pose[1], wrapped(s.pose[2])
     s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]

@@ -24,7 +24,7 @@ from mrctl.sensing.ekf import (
     ekf,
 )
 from mrctl.sensing.localisation import Localiser
-from mrctl.sensing.prediction import SEEN, predict, wrapped
+from mrctl.sensing.prediction import SEEN, predict, settle, wrapped
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors, command_all, sample_all
 from mrctl.sensing.slip import slip_ratio
@@ -68,24 +68,33 @@ def truth(
         geometry: A record of `GEOMETRY`.
         period: Control period in s.
         memory: In and out: state of the estimator for this robot.
-        s: In and out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
+        s: In and out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`. It also writes the
+            `twist` of the tick at which its samples were taken to `ring`.
     """
     for k in range(3):
         s.estimate[k] = true.reading.pose[k]
     s.estimate[3], s.estimate[4] = true.reading.twist[0], true.reading.twist[1]
+    settle(s.estimate, tick, ring, i)
 
 
 @kernel
-def odometry(
-    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
-) -> None:
-    """The estimator `odometry`: distance from the encoders, heading from the gyro, without any correction.
+def reckon(tick: int, ring: Rows, i: int, geometry: Row, period: float, m: Array, s: Row) -> None:
+    """Dead reckoning from the distance by the encoders and the heading by the gyro.
 
         Δs = r (Δφ_l + Δφ_r)/2,    Δθ = T (ω_k + ω_{k−1})/2,    V = r (φ̇_l + φ̇_r)/2
 
-    The heading in the middle of the period is the direction of Δs. The arguments are those of `truth`.
+    The heading in the middle of the period is the direction of Δs.
+
+    Args:
+        tick: As for `truth`, and so are the others.
+        ring: Samples and commands.
+        i: Index of the robot.
+        geometry: A record of `GEOMETRY`.
+        period: Control period in s.
+        m: In and out: `mean` of `SAMPLED_MOTION`.
+        s: In and out: record of `SEEN`, whose `estimate` is the result.
     """
-    now, m = tick - s.age, memory.mean
+    now = tick - s.age
     if now > s.start:
         this, last = ring[now % len(ring), i], ring[(now - 1) % len(ring), i]
         way = geometry.wheel_radius * (this.encoder[0] - last.encoder[0] + this.encoder[1] - last.encoder[1]) / 2
@@ -100,15 +109,27 @@ def odometry(
 
 
 @kernel
+def odometry(
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
+) -> None:
+    """The estimator `odometry`: dead reckoning without any correction; the arguments are those of `truth`."""
+    reckon(tick, ring, i, geometry, period, memory.mean, s)
+    settle(memory.mean, tick - s.age, ring, i)
+
+
+@kernel
 def user(
     tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
     """The estimate of a user's estimator, or odometry from its last valid one; the arguments are those of `truth`."""
-    odometry(tick, true, ring, i, sensor, geometry, period, memory, s)
+    reckon(tick, ring, i, geometry, period, memory.mean, s)
     if memory.valid:
         for k in range(5):  # the mean is as old as the samples, so that odometry can go on from it
             memory.mean[k] += memory.answer[k] - s.estimate[k]
             s.estimate[k] = memory.answer[k]
+        settle(s.estimate, tick, ring, i)
+    else:
+        settle(memory.mean, tick - s.age, ring, i)
 
 
 @kernel
@@ -132,6 +153,19 @@ def receive_all(tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Row
     """Calls `receive` for all robots."""
     for i in range(len(seen)):
         receive(tick, plant[i], ring, i, sensors[i], geometry, seen[i])
+
+
+@kernel
+def find_slip(tick: int, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, s: Row) -> None:
+    """Updates the slip ratio in the record of `SEEN` from the last tick whose encoder samples and twist are known.
+
+    Encoders of now and a twist of then would differ by an acceleration, which is no slip. The arguments are those of
+    `truth`.
+    """
+    known = tick - max(s.age, sensor.encoder_latency)
+    if known >= s.start:
+        then, r, D = ring[known % len(ring), i], geometry.wheel_radius, geometry.half_track
+        s.slip = slip_ratio(then.rate, then.twist[0], then.twist[1], r, D, period, s.slip)
 
 
 observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces
@@ -159,7 +193,7 @@ def estimate(
         receive(tick, plant[i], ring, i, sensor, geometry, s)
         observe(tick, plant[i], ring, i, sensor, geometry, period, memory[i], s)
         predict(s.estimate, tick, tick + s.delay, ring, i, period, s)
-        s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry.half_track, period, s.slip)
+        find_slip(tick, ring, i, sensor, geometry, period, s)
 
 
 @kernel

@@ -81,6 +81,13 @@ def predict(state: Array, first: int, last: int, ring: Rows, i: int, period: flo
 
 
 @kernel
+def settle(state: Array, tick: int, ring: Rows, i: int) -> None:
+    """Writes V and θ̇ of the state of a tick, x, y, θ, V, θ̇, to the samples of that tick; see `predict` for units."""
+    twist = ring[tick % len(ring), i].twist
+    twist[0], twist[1] = state[3], state[4]
+
+
+@kernel
 def wrapped(angle: float) -> float:
     """Returns an angle in rad in (−π, π]."""
     return np.pi - (np.pi - angle) % (2 * np.pi)

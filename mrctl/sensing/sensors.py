@@ -61,6 +61,7 @@ SAMPLE = np.dtype(
         ("fix_arrives", "?"),  # whether it arrives
         ("grip", "u1", 2),  # whether the wheels grip, left and right; an estimator writes it
         ("doubt", "f8"),  # standard deviation that the wheel radii' relative errors have at least; likewise
+        ("twist", "f8", 2),  # V in m/s and θ̇ in rad/s of this tick, as they are estimated by now; likewise
         ("command", "f8", 2),  # derivative of the commanded twist that was computed in this tick, m/s² and rad/s²
     ],
     align=True,

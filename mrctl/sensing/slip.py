@@ -9,21 +9,24 @@ SLIP_SPEED = 0.3  # m/s, least divisor of a slip, so that noise does not count a
 
 
 @kernel
-def slip_ratio(wheel_speeds: Array, v: float, omega: float, half_track: float, period: float, slip: float) -> float:
+def slip_ratio(
+    rates: Array, v: float, omega: float, wheel_radius: float, half_track: float, period: float, slip: float
+) -> float:
     """Slip ratio of the driven wheel that slips more, behind a first-order low-pass.
 
-        |v_i − u_i| / max(|v_i|, |u_i|, 0.3 m/s),    u_l,r = V ∓ D θ̇
+        |v_i − u_i| / max(|v_i|, |u_i|, 0.3 m/s),    v_i = r φ̇_i,    u_l,r = V ∓ D θ̇
 
     where v_i is the circumferential speed of a wheel from its encoder, and u_i the speed of its axle over the floor by
-    the estimated motion. The low-pass prevents a jolt from counting as slip, and prolongs a slip until it has left the
-    filters of a learner. Odometry, whose V is the mean of the encoders, shows about half of the slip of one wheel. A
-    relative error of the wheel radius appears as a slip ratio of the same size, and noise as one of 0.8 of its standard
-    deviation over the speed.
+    the motion that is estimated for the same time. The low-pass prevents a jolt from counting as slip, and prolongs a
+    slip until it has left the filters of a learner. Odometry, whose V is the mean of the encoders, shows about half of
+    the slip of one wheel. A relative error of the wheel radius appears as a slip ratio of the same size, and noise as
+    one of 0.8 of its standard deviation over the speed.
 
     Args:
-        wheel_speeds: v left and right, from encoders and nominal wheel radius, in m/s, `(2,)`.
+        rates: φ̇ left and right from the encoders in rad/s, `(2,)`.
         v: Estimated V in m/s.
         omega: Estimated θ̇ in rad/s.
+        wheel_radius: Nominal r in m.
         half_track: D in m.
         period: Control period in s.
         slip: Slip ratio of the last period.
@@ -33,7 +36,6 @@ def slip_ratio(wheel_speeds: Array, v: float, omega: float, half_track: float, p
     """
     worst = 0.0
     for k in range(2):
-        carried = v + (2 * k - 1) * half_track * omega
-        speed = max(abs(wheel_speeds[k]), abs(carried), SLIP_SPEED)
-        worst = max(worst, abs(wheel_speeds[k] - carried) / speed)
+        rolled, carried = wheel_radius * rates[k], v + (2 * k - 1) * half_track * omega
+        worst = max(worst, abs(rolled - carried) / max(abs(rolled), abs(carried), SLIP_SPEED))
     return slip + period / (period + SLIP_FILTER) * (worst - slip)

@@ -19,7 +19,7 @@ PERIOD = 0.01
 NOISY = {"gyro_noise": 1e-3, "gyro_walk": 1e-3, "gyro_bias": 0.01, "accelerometer_noise": 1e-3,
          "accelerometer_walk": 1e-3, "accelerometer_bias": 0.1, "encoder_counts": 1000, "fix_position_noise": 0.01,
          "fix_heading_noise": 0.02, "fix_lost": 0.2, "fix_outliers": 0.1}  # fmt: skip
-STREAMS = [name for name in SAMPLE.names or () if name not in ("grip", "doubt", "command")]
+STREAMS = [name for name in SAMPLE.names or () if name not in ("grip", "doubt", "twist", "command")]
 
 
 def ideal(**values):
@@ -344,7 +344,7 @@ def slip_of(wheels, v, omega, ticks=400):
     """Returns the slip ratio after a slip has lasted for some ticks."""
     slip = 0.0
     for _ in range(ticks):
-        slip = slip_ratio(np.array(wheels, float), float(v), float(omega), 0.2, PERIOD, slip)
+        slip = slip_ratio(np.array(wheels, float) / 0.1, float(v), float(omega), 0.1, 0.2, PERIOD, slip)
     return slip
 
 
@@ -367,5 +367,5 @@ def test_slip_lasts():
     """A slip that has ended fades with the filter's time constant."""
     slip = 1.0
     for _ in range(round(SLIP_FILTER / 0.001)):
-        slip = slip_ratio(np.ones(2), 1.0, 0.0, 0.2, 0.001, slip)
+        slip = slip_ratio(np.ones(2), 1.0, 0.0, 1.0, 0.2, 0.001, slip)
     assert slip == pytest.approx(np.exp(-1), rel=0.01)
