@@ -114,7 +114,11 @@ def odometry(
 ) -> None:
     """The estimator `odometry`: dead reckoning without any correction; the arguments are those of `truth`."""
     reckon(tick, ring, i, geometry, period, memory.mean, s)
-    settle(memory.mean, tick - s.age, ring, i)
+    now = tick - s.age
+    settle(memory.mean, now, ring, i)
+    if sensor.quantum > 0 and ring[now % len(ring), i].encoder_new:  # V is a mean since the last sample
+        for t in range(now + 1 - sensor.encoder_every, now):
+            ring[t % len(ring), i].twist[0] = memory.mean[3]
 
 
 @kernel
@@ -159,13 +163,20 @@ def receive_all(tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Row
 def find_slip(tick: int, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, s: Row) -> None:
     """Updates the slip ratio in the record of `SEEN` from the last tick whose encoder samples and twist are known.
 
-    Encoders of now and a twist of then would differ by an acceleration, which is no slip. The arguments are those of
-    `truth`.
+    Encoders of now and a twist of then would differ by an acceleration, which is no slip. The rate of an encoder that
+    counts is the mean since its last sample, and is compared with the mean twist. The arguments are those of `truth`.
     """
     known = tick - max(s.age, sensor.encoder_latency)
     if known >= s.start:
-        then, r, D = ring[known % len(ring), i], geometry.wheel_radius, geometry.half_track
-        s.slip = slip_ratio(then.rate, then.twist[0], then.twist[1], r, D, period, s.slip)
+        taken = known - (known - s.start) % sensor.encoder_every  # when the encoders were sampled
+        first = max(s.start, taken + 1 - sensor.encoder_every) if sensor.quantum > 0 else taken
+        v, omega = 0.0, 0.0
+        for t in range(first, taken + 1):
+            then = ring[t % len(ring), i].twist
+            v += then[0] / (taken + 1 - first)
+            omega += then[1] / (taken + 1 - first)
+        rates, r, D = ring[taken % len(ring), i].rate, geometry.wheel_radius, geometry.half_track
+        s.slip = slip_ratio(rates, v, omega, r, D, period, s.slip)
 
 
 observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces

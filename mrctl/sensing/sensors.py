@@ -160,9 +160,10 @@ class Sensors:
         waits = [
             max(s.periods(f"{name}_latency", period) for name in ("encoder", "gyro", "accelerometer", "fix"))
             + s.periods("delay", period)
+            + 2 * s.periods("encoder_rate", period)
             for s in sensing
         ]
-        self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
+        self.ring = np.zeros((max(waits), size), SAMPLE)
         self._noisy = [any(s[name] for name in RANDOM) for s in sensing]
         self.noise = np.zeros((NOISE_BLOCK if any(self._noisy) else 1, size), NOISE)
         self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]

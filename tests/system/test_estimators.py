@@ -369,6 +369,17 @@ def test_acceleration_is_no_slip(estimator):
     assert result.slip.max() < 0.05 and not result.failed.any()
 
 
+@pytest.mark.parametrize("estimator", ["truth", "odometry", "ekf"])
+@pytest.mark.parametrize("counts", [0, 88_064])
+def test_slow_encoders_are_no_slip(estimator, counts):
+    """Encoders that are read ten times in a second show no slip: the mean of their rates is compared with a mean."""
+    slow = {"encoder_counts": counts, "encoder_rate": 10}
+    sensing = Sensing(tier="lab", estimator=estimator, **slow)
+    scenario = Scenario(reference=Lemniscate(period=10), laps=1, learner="none", sensing=sensing)
+    result = simulate(scenario.replace(perturbation="all"))
+    assert result.slip.max() < 0.05 and not result.failed
+
+
 # -- a user's own estimator --------------------------------------------------------------------------------------------
 
 LANE = Scenario(
