@@ -63,6 +63,7 @@ RADIUS_AVERAGE = 1.0  # s, time constant of the mean of the wheels' difference, 
 # m/s² and rad/s², standard deviations of V̇ and of the mean θ̈ from where the last sample of a slow sensor was taken to
 # where it is used; chosen
 HELD_NOISE = 0.5, 1.0
+MISS_AVERAGE = 1.0  # s, time constant of the mean square by which predictions over the latency miss; chosen
 OBSERVER_BANDWIDTH = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
 
 EKF = np.dtype(
@@ -87,6 +88,8 @@ EKF = np.dtype(
         ("drift_bound", "f8"),  # on these means; infinite where the fixes are not independent of encoders and gyro
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
+        ("missed", "f8", 2),  # mean square by which predictions over the latency miss V and θ̇, (m/s)² and (rad/s)²
+        ("ahead", "f8", (5, 5)),  # scratch: covariance of posture and twist after the latency
         ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIP_SIGMAS`, and gyro sample
     ],
     align=True,
@@ -429,6 +432,64 @@ def go_back(k: int, s: Row) -> None:
 
 
 @kernel
+def find_misses(now: int, ring: Rows, i: int, period: float, f: Row, s: Row) -> None:
+    """Compares V and θ̇ of a tick with what was predicted for it when its samples had not arrived.
+
+    The robot does not accelerate as commanded, and by how much depends on controllers, loads and motors that the filter
+    does not know. Therefore the variance of the prediction is the running mean square of what it has missed.
+
+    Args:
+        now: The last tick whose samples have arrived.
+        ring: As for the estimator `truth`, and so are `i` and `period`; its `twist` is the prediction.
+        i: Index of the robot.
+        period: Control period in s.
+        f: In and out: a record of `EKF`.
+        s: A record of `SEEN`.
+    """
+    count = now - s.start - s.age  # number of predictions over the whole latency until now
+    if s.age > 0 and count > 0:
+        for k in range(2):
+            miss = f.mean[V + k] - ring[now % len(ring), i].twist[k]
+            f.missed[k] += max(period / MISS_AVERAGE, 1 / count) * (miss * miss - f.missed[k])
+
+
+@kernel
+def predict_covariance(count: int, period: float, f: Row, s: Row) -> None:
+    """Predicts the covariance of posture and twist over the latency L into `ahead`.
+
+        P ← F P Fᵀ + g_a g_aᵀ m_V + g_θ g_θᵀ m_θ̇
+
+    F, g_a and g_θ are those of `propagate` for one step of the duration L, in which V and θ̇ miss by 1 with a constant
+    acceleration; m is their mean square, `missed`.
+
+    Args:
+        count: L in control periods.
+        period: Control period in s.
+        f: In and out: a record of `EKF`.
+        s: A record of `SEEN`, with the estimate after L.
+    """
+    P, L = f.ahead, count * period
+    for i in range(5):
+        for j in range(5):
+            P[i, j] = f.P[i, j]
+    if count == 0:
+        return
+    v, heading = (f.mean[V] + s.twist[0]) / 2, (f.mean[THETA] + s.pose[2]) / 2
+    c, sn = L * np.cos(heading), L * np.sin(heading)
+    for transposed in range(2):
+        Q = P.T if transposed else P
+        for j in range(5):
+            direction = v * (Q[THETA, j] + L / 2 * Q[OMEGA, j])
+            Q[X, j] += c * Q[V, j] - sn * direction
+            Q[Y, j] += sn * Q[V, j] + c * direction
+            Q[THETA, j] += L * Q[OMEGA, j]
+    g_a, g_theta = (c / 2, sn / 2, 0.0, 1.0, 0.0), (-sn * v * L / 4, c * v * L / 4, L / 2, 0.0, 1.0)
+    for i in range(5):
+        for j in range(5):
+            P[i, j] += f.missed[0] * g_a[i] * g_a[j] + f.missed[1] * g_theta[i] * g_theta[j]
+
+
+@kernel
 def ekf(
     tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
@@ -460,10 +521,13 @@ def ekf(
                     absorb_fix(sample.fix, f)
             else:
                 keep(now, f)
+    find_misses(now, ring, i, period, f, s)
     settle(f.mean, now, ring, i)
     predict(f.mean, max(now, s.start), tick, ring, i, period, s)
     s.estimate[0], s.estimate[1], s.estimate[2] = s.pose[0], s.pose[1], wrapped(s.pose[2])
     s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]
-    P = f.P
+    settle(s.estimate, tick, ring, i)
+    predict_covariance(tick - max(now, s.start), period, f, s)
+    P = f.ahead
     s.variance[0], s.variance[1], s.variance[2] = P[X, X], P[X, Y], P[Y, Y]
     s.variance[3], s.variance[4], s.variance[5] = P[THETA, THETA], P[V, V], P[OMEGA, OMEGA]

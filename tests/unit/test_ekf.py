@@ -9,7 +9,7 @@ from mrctl.physics.plant import PLANT
 from mrctl.sensing import ekf as laws
 from mrctl.sensing.ekf import EKF, FIX_GATE, LOST_FIXES
 from mrctl.sensing.estimators import GEOMETRY, Estimator
-from mrctl.sensing.prediction import wrapped
+from mrctl.sensing.prediction import SEEN, wrapped
 from mrctl.sensing.sensors import SAMPLE, Sensors
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.robot import Tyres
@@ -335,6 +335,34 @@ def test_drift_of_innovations():
 
 def lab(**values):
     return Sensing(tier="lab", delay=0.0, **values)
+
+
+@given(st.integers(0, 10**6), st.integers(0, 20))
+@settings(max_examples=20)
+def test_covariance_after_the_latency(seed, count):
+    """It is F P Fᵀ and the accelerations by which predictions miss, with F of one step over the whole latency."""
+    s, rng = random_filter(seed)
+    s["missed"] = rng.uniform(0, 1e-2, 2)
+    seen, L = np.zeros(1, SEEN)[0], count * T
+
+    def step(x, v_dot, omega_dot):
+        v, omega = x[V] + v_dot * L / 2, x[OMEGA] + omega_dot * L / 2
+        heading = x[THETA] + omega * L / 2
+        return np.array([
+            x[X] + L * v * np.cos(heading), x[Y] + L * v * np.sin(heading), x[THETA] + L * omega, x[V] + L * v_dot,
+            x[OMEGA] + L * omega_dot,
+        ])  # fmt: skip
+
+    x, P = s["mean"][:5].copy(), s["P"][:5, :5].copy()
+    after = step(x, 0.0, 0.0)
+    seen["pose"], seen["twist"] = after[:3], after[3:]
+    F = jacobian(lambda z: step(z, 0.0, 0.0), x)
+    expected = F @ P @ F.T
+    if count:
+        G = jacobian(lambda u: step(x, u[0] / L, u[1] / L), np.zeros(2))
+        expected += G @ np.diag(s["missed"]) @ G.T
+    laws.predict_covariance(count, T, s, seen)
+    np.testing.assert_allclose(s["ahead"], expected, rtol=1e-9, atol=1e-15)
 
 
 def test_late_fix():
