@@ -143,9 +143,11 @@ class Sensing(Record):
     fix_outliers: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of the fixes that are wrong by up to 1 m in x and y; not with a lidar."""
     start_position_noise: Annotated[float, Field(ge=0, le=10)] | None = None
-    """Standard deviation of x and y of the first estimate of the posture in m; by default that of a fix."""
+    """Standard deviation of x and y of the first estimate of the posture in m; by default that of a fix. The
+    estimator `truth` has none."""
     start_heading_noise: Annotated[float, Field(ge=0, le=3)] | None = None
-    """Standard deviation of the heading of the first estimate in rad; by default that of a fix."""
+    """Standard deviation of the heading of the first estimate in rad; by default that of a fix. The estimator
+    `truth` has none."""
     start_unknown: bool = False
     """Whether the robot starts without an estimate of its posture, and looks for its place on the whole map; only with
     localisation by `scan` or `particles`."""
