@@ -20,11 +20,12 @@ from tqdm import tqdm
 
 from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
+from mrctl.control.weights import MAX_BYTES
 from mrctl.loop import user_files
 from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.simulation import Simulation, arranged, cores, simulate, titles
 from mrctl.physics import mjcf
-from mrctl.record import InputError, printable
+from mrctl.record import InputError, printable, read_file
 from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
@@ -111,6 +112,7 @@ def _absolute(sweep: Sweep) -> Sweep:
     Raises:
         InputError: A file is missing.
     """
+    sweep = sweep.with_files({file: str(Path(file).absolute()) for file in sweep.files})
     if sweep.controller:
         return sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
     axes = list(sweep.axes)
@@ -208,14 +210,23 @@ def code_digest(but: tuple[str, ...] = SHOWING_ROOMS) -> str:
 
 
 def _models(sweep: Sweep) -> dict[str, str]:
-    """Returns digests of the compiled worlds with their robots, and of the files of the user's stages, by name."""
+    """Returns digests of the compiled worlds with their robots, of the user's stages, and of `files`, by name."""
     worlds = {
         ", ".join(filter(None, (world, steering))) + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
             mjcf.load(world, steering, robot=robot)
         )
         for world, steering, robot in sweep.worlds
     }
-    return worlds | {own: user_files.digest(own) for own in sweep.drivers if own}
+    return worlds | {own: user_files.digest(own) for own in sweep.drivers if own} | _digests(sweep.files)
+
+
+def _digests(files: Iterable[str]) -> dict[str, str]:
+    """Returns the SHA-256 of files from which learners start, by name.
+
+    Raises:
+        InputError: A file cannot be read.
+    """
+    return {file: hashlib.sha256(read_file(file, MAX_BYTES)).hexdigest() for file in files}
 
 
 def compute(path: str, job: int) -> JobOutcome:
@@ -229,6 +240,7 @@ def compute(path: str, job: int) -> JobOutcome:
         store = Store(path)
         sweep = _agreed(json.dumps(store.manifest))
         rows, signals = _compute(sweep, store.runs(job), store.samples)
+        _check_alike(_digests(sweep.files), store.manifest)  # again: a file may have changed or gone meanwhile
         store.write(job, _table(sweep, rows), signals)
         return JobOutcome(job, failed=sum(row["failed"] for row in rows))
     except InputError as error:
@@ -246,17 +258,25 @@ def _agreed(manifest: str) -> Sweep:
     Raises:
         InputError: This worker has other versions or other worlds than the process that began the store.
     """
-    agreed = json.loads(manifest)
-    worker = f"worker {os.getpid()} on {os.uname().nodename}"
+    agreed, worker = json.loads(manifest), _worker()
     for name, version in versions().items():
         if version != (begun := agreed["versions"].get(name)):
             raise InputError(f"{worker}: has {name} {version}, but the store was begun with {name} {begun}")
     if agreed.get("code") != code_digest():
         raise InputError(f"{worker}: has other laws than the process that began the store")
     sweep = Sweep.from_dict(agreed["sweep"], "sweep")
-    if unlike := [name for name, digest in _models(sweep).items() if digest != agreed["models"].get(name)]:
-        raise InputError(f"{worker}: {unlike[0]} is not the store's")
+    _check_alike(_models(sweep), agreed)
     return sweep
+
+
+def _check_alike(models: dict[str, str], agreed: dict[str, Any]) -> None:
+    """Raises `InputError` if this worker has other worlds or files than those of a manifest."""
+    if unlike := [name for name, digest in models.items() if digest != agreed["models"].get(name)]:
+        raise InputError(f"{_worker()}: {unlike[0]} is not the store's")
+
+
+def _worker() -> str:
+    return f"worker {os.getpid()} on {os.uname().nodename}"
 
 
 def driver(sweep: Sweep, stages: Stages) -> Callable[..., xr.Dataset]:

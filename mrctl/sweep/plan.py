@@ -9,9 +9,10 @@ only in `paired` axes share their draws.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import product
 from multiprocessing import parent_process
@@ -37,6 +38,7 @@ TRIED_RUNS = 20  # number of first runs, at least one of which must have a valid
 QUIET_TIME = 2.0  # s for which values are checked without a progress bar
 SCENARIO_FIELD = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 CONTROLLER_FIELD = "controller"  # the field of an axis whose values say what drives
+FILE_FIELDS = "learned", "fel.weights"  # fields of the scenario with the name of a file that each run reads
 
 
 class Chosen(NamedTuple):
@@ -409,17 +411,36 @@ class Sweep(Record):
     def _plain(self) -> dict[str, Any]:
         return self.base.model_dump(mode="json")
 
+    @property
+    def files(self) -> set[str]:
+        """Files from which learners start, as the base and the listed values name them."""
+        values = [(SCENARIO_FIELD, self._plain), *((axis.field, value) for axis in self.axes for value in axis.listed)]
+        return {file for field, value in values for file in _named_files(field, value)}
+
+    def with_files(self, names: Mapping[str, str]) -> Self:
+        """Returns the sweep with other names of its `files`."""
+        if not names:
+            return self
+        base = Scenario.from_dict(_with_files(SCENARIO_FIELD, self._plain, names))
+        axes = [
+            axis.replace(values=[_with_files(axis.field, value, names) for value in axis.values])
+            if axis.values is not None
+            else axis
+            for axis in self.axes
+        ]
+        return self.replace(base=base, axes=axes)
+
     @cached_property
     def worlds(self) -> list[tuple[str, Any, RobotFile]]:
-        """Worlds, steering arrangements and robots that the runs may combine."""
-        listed = {axis.field: axis.listed for axis in self.axes}
-        names = ("world", "steering", "robot")
+        """Worlds, steering arrangements and robots that the runs combine."""
+        names = SCENARIO_FIELD, "world", "steering", "robot"
+        groups = [g for g in self._dimensions if any(self.axes[a].field.split(".")[0] in names for a in g)]
         found = set()
-        for whole in listed.get(SCENARIO_FIELD, ({},)):
-            worlds, steerings, robots = (listed.get(n, (whole.get(n, getattr(self.base, n)),)) for n in names)
-            files = [RobotFile.model_validate(robot) for robot in robots]
-            files = [f.model_copy(update={"path": p}) for f in files for p in listed.get("robot.path", (f.path,))]
-            found |= set(product(worlds, steerings, files))
+        for place in product(*(range(self._length(group)) for group in groups)):
+            values = {self.axes[a].field: self.axes[a].listed[k] for k, g in zip(place, groups, strict=True) for a in g}
+            with contextlib.suppress(InputError):  # no scenario, and so no run, has these values
+                one = self._assemble(self._middle | values)
+                found.add((one.world, one.steering, one.robot))
         return sorted(found, key=str)
 
     @cached_property
@@ -438,6 +459,29 @@ class Sweep(Record):
         if self.record == "laps":
             columns |= {f"{name}_per_lap": (pa.list_(pa.float64()), unit) for name, (unit, _) in METRICS.items()}
         return pa.schema([pa.field(name, kind, metadata={"units": u}) for name, (kind, u) in columns.items()])
+
+
+def _inner(field: str, key: str) -> str:
+    """Returns the dotted path of what has this key in the table at a path."""
+    return key if field == SCENARIO_FIELD else f"{field}.{key}"
+
+
+def _named_files(field: str, value: object) -> Iterator[str]:
+    """Yields the names of files in a value of the field at a dotted path."""
+    if field in FILE_FIELDS and isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            yield from _named_files(_inner(field, key), part)
+
+
+def _with_files(field: str, value: object, names: Mapping[str, str]) -> Any:  # noqa: ANN401
+    """Returns a value of the field at a dotted path with other names of files."""
+    if field in FILE_FIELDS and isinstance(value, str):
+        return names[value]
+    if isinstance(value, dict):
+        return {key: _with_files(_inner(field, key), part, names) for key, part in value.items()}
+    return value
 
 
 def _put(data: Any, field: str, value: object) -> Any:  # noqa: ANN401

@@ -1,6 +1,6 @@
 """The store of a sweep: a folder that stays valid when its process is killed at any moment.
 
-    STORE/sweep.json        the sweep, versions, digests of the compiled worlds; written first, whole or not at all
+    STORE/sweep.json        the sweep, versions, digests of worlds and files; written first, whole or not at all
     STORE/runs.parquet      the table of runs, one row each, in order; written when no job is left
     STORE/parts/000012.parquet   rows of job 12; folded into the table, and removed once every job is in it
     STORE/signals.zarr      (run, time, signal), NaN where nothing was recorded; shard 12 is the record of job 12

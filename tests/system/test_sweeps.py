@@ -279,6 +279,62 @@ def test_changed_sweep(file, store, capsys, whole):
     assert content(store) == whole
 
 
+def learned(path, seed):
+    """Writes what `fel` has learned on a short line."""
+    scenario = mrctl.Scenario(learner="fel", laps=1, reference=mrctl.Line(length=0.4), seed=seed)
+    mrctl.save_learned(path, mrctl.simulate(scenario))
+
+
+def loses_file(path, job):
+    """The file from which the runs start is gone after job 0."""
+    outcome = compute(path, job)
+    Path(path).parent.joinpath("first.safetensors").unlink(missing_ok=True)
+    return outcome
+
+
+@HERE
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"base": {"learned": "first.safetensors"}},
+        {"base": {"fel": {"weights": "first.safetensors"}}},
+        {"axes": [{"field": "learned", "values": ["first.safetensors"]}]},
+        {"axes": [{"field": "fel", "values": [{"weights": "first.safetensors"}]}]},
+        {"axes": [{"field": "scenario", "values": [{"learned": "first.safetensors"}, {}]}]},
+    ],
+    ids=str,
+)
+def test_files_that_learners_start_from(tmp_path, monkeypatch, capsys, change):
+    """They are found from every folder; one that has changed or is gone stops the sweep, and no run fails for it."""
+    for seed, name in enumerate(("first.safetensors", "second.safetensors")):
+        learned(tmp_path / name, seed)
+    base = {"learner": "fel", "laps": 1, "reference": {"kind": "line", "length": 0.4}} | change.get("base", {})
+    sweep, store = Sweep.from_dict({"runs": 4, "chunk": 2, **change, "base": base}), tmp_path / "store"
+    monkeypatch.chdir(tmp_path)
+    other, first = tmp_path / "elsewhere", tmp_path / "first.safetensors"
+    other.mkdir()
+
+    def from_elsewhere(path, job, work=compute):
+        with contextlib.chdir(other):
+            return work(path, job)
+
+    kept = first.read_bytes()
+    with pytest.raises(InputError, match=f"^{first}: No such file"):
+        jobs.run(sweep, store, 1, work=partial(from_elsewhere, work=loses_file))
+    assert Store(store).done() == {0}
+    with pytest.raises(InputError, match=f"^{first}: No such file"):
+        jobs.run(sweep, store, 1)
+    shutil.copy("second.safetensors", "first.safetensors")
+    with pytest.raises(InputError, match=f"{first} has changed since this sweep was begun"):
+        jobs.run(sweep, store, 1)
+    with pytest.raises(InputError, match=f"worker .*: {first} is not the store's"):
+        jobs._agreed.cache_clear()
+        jobs._agreed(json.dumps(Store(store).manifest))
+    first.write_bytes(kept)
+    jobs.run(sweep, store, 1, work=from_elsewhere)
+    assert not set(pd.read_parquet(store / "runs.parquet")["failure"]) - {""}
+
+
 def test_digest_of_the_code(tmp_path):
     """It changes with a design that holds no kernel, and not with the viewer."""
     package = Path(mrctl.__file__).parent

@@ -80,6 +80,18 @@ def test_zip():
     assert {(v["laps"], v["perturbation.slope"]) for v in drawn(one)} == {(1, 0.0), (2, 0.1)}
 
 
+def test_worlds_are_those_that_the_runs_combine():
+    """Zipped values of robot and steering are no product; the fields of a robot, and tables, are combined with them."""
+    robots = {"field": "robot.path", "values": ["car", "turtlebot"], "zip": "a"}
+    steering = {"field": "steering", "values": ["compliant", "caster"], "zip": "a"}
+    pairs = {("compliant", "car"), ("caster", "turtlebot")}
+    assert {(way, robot.path) for _, way, robot in sweep(robots, steering).worlds} == pairs
+    tables = {"field": "scenario", "values": [{"world": "rough", "learner": "none"}, {"world": "slope"}]}
+    one = sweep(tables, robots, steering, LAWS)
+    driven = {(s.world, s.steering, s.robot) for s in map(one.scenario, range(one.size))}
+    assert one.worlds == sorted(driven, key=str) and len(driven) == 4
+
+
 def test_seed_may_be_an_axis():
     """Then it is not drawn."""
     assert [sweep({"field": "seed", "values": [7, 8]}).scenario(run).seed for run in range(2)] == [7, 8]
