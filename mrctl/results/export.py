@@ -1,7 +1,8 @@
 """Results for other tools: MCAP with ROS 2 messages, CSV, Parquet, NumPy.
 
 Tables hold every signal of `results.dataset.SIGNALS` and end where a run failed. With several runs a table has the
-columns `run` and `label`, its number and its name, and in MCAP the name of each topic begins with `/runK`.
+columns `run` and `label`, its number and its name, and in MCAP the name of each topic begins with `/runK`. A run that
+did not drive, such as an impossible one, is left out, and a warning names it.
 
 | topic            | message                                 | content                                              |
 | ---------------- | --------------------------------------- | ---------------------------------------------------- |
@@ -29,6 +30,7 @@ from __future__ import annotations
 import contextlib
 import json
 import uuid
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -122,11 +124,11 @@ def export(
             scenario in the result is used. The dataset of a sweep holds none.
 
     Returns:
-        The number of runs that were written.
+        The number of runs that were written: those that drove.
 
     Raises:
-        InputError: There is no such format or run, the result has no signals or no scenarios, the file exists or cannot
-            be written, or the library for the format is missing.
+        InputError: There is no such format or run, no run drove, the result has no signals or no scenarios, the file
+            exists or cannot be written, or the library for the format is missing.
     """
     if to not in get_args(Format):
         raise InputError(f"to: {to!r} is not {', '.join(get_args(Format))}")
@@ -140,13 +142,14 @@ def export(
         whole = whole.sel(run=[run])
     if out.exists():
         raise InputError(f"{out}: exists already, nothing was overwritten")
-    writers: dict[Format, Callable[[xr.Dataset, Path], None]] = {
+    several, whole = whole.sizes["run"] > 1, _that_drove(whole)
+    writers: dict[Format, Callable[[xr.Dataset, bool, Path], None]] = {
         "mcap": partial(_mcap, scenario), "csv": _csv, "parquet": _parquet, "npz": _npz,
     }  # fmt: skip
     unfinished = out.with_name(f".{out.name}.{uuid.uuid4().hex}.partial")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        writers[to](whole, unfinished)
+        writers[to](whole, several, unfinished)
         unfinished.rename(out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
@@ -154,6 +157,26 @@ def export(
         with contextlib.suppress(OSError):
             unfinished.unlink()
     return whole.sizes["run"]
+
+
+def _that_drove(whole: xr.Dataset) -> xr.Dataset:
+    """Returns the runs that drove at all, with a warning that names the others.
+
+    Raises:
+        InputError: There is none.
+    """
+    drove = np.zeros(whole.sizes["run"], bool)
+    for k, number in enumerate(whole["run"].values):
+        with reading(f"signals of run {int(number)}"):
+            drove[k] = np.isfinite(whole["x"].isel(run=k).values).any()
+    idle = whole["run"].values[~drove].tolist()
+    if not drove.any():
+        why = f"; run {idle[0]}: {whole['failure'].values[0]}" if idle and "failure" in whole else ""
+        raise InputError(f"result: holds no run that drove{why}" if idle else "result: holds no run")
+    if idle:
+        more = f" and {len(idle) - 10} more" if len(idle) > 10 else ""
+        warnings.warn(f"run: {', '.join(map(str, idle[:10]))}{more} did not drive; left out", stacklevel=3)
+    return whole.isel(run=drove)
 
 
 def _runs(whole: xr.Dataset) -> Iterator[tuple[int, Columns]]:
@@ -169,9 +192,8 @@ def _unit(name: str) -> str:
     return "s" if name == "time" else SIGNALS[name][0]
 
 
-def _table(whole: xr.Dataset) -> Iterator[pa.Table]:
+def _table(whole: xr.Dataset, several: bool) -> Iterator[pa.Table]:
     """Yields a table for each run, with units and meanings in its fields, and scenarios and versions in its schema."""
-    several = whole.sizes["run"] > 1
     about = {name: str(value) for name, value in whole.attrs.items()}
     for label, (number, columns) in zip(np.atleast_1d(whole["label"]), _runs(whole), strict=True):
         fields, arrays = list[pa.Field](), list[Any]()
@@ -186,24 +208,24 @@ def _table(whole: xr.Dataset) -> Iterator[pa.Table]:
         yield pa.table(arrays, schema=pa.schema(fields, metadata=about))
 
 
-def _parquet(whole: xr.Dataset, path: Path) -> None:
+def _parquet(whole: xr.Dataset, several: bool, path: Path) -> None:
     writer = None
-    for table in _table(whole):
+    for table in _table(whole, several):
         writer = writer or pq.ParquetWriter(path, table.schema)
         writer.write_table(table)
     if writer:
         writer.close()
 
 
-def _csv(whole: xr.Dataset, path: Path) -> None:
+def _csv(whole: xr.Dataset, several: bool, path: Path) -> None:
     """Writes names and units in the first line, as `v [m/s]`, and numbers in full precision."""
-    for k, table in enumerate(_table(whole)):
+    for k, table in enumerate(_table(whole, several)):
         names = {field.name: f"{field.name} [{field.metadata[b'units'].decode()}]" for field in table.schema}
         names = {name: name if text.endswith("[1]") else text for name, text in names.items()}
         table.to_pandas().rename(columns=names).to_csv(path, index=False, header=k == 0, mode="a" if k else "w")
 
 
-def _npz(whole: xr.Dataset, path: Path) -> None:
+def _npz(whole: xr.Dataset, _several: bool, path: Path) -> None:
     """Writes `time` (T,), `run` (R,) and each signal (R, T), NaN after a failure; units and scenarios are JSON."""
     with reading("signals"):
         whole = whole.load()
@@ -225,7 +247,7 @@ def _definition(name: str) -> str:
     return own + "".join(f"\n{'=' * 80}\nMSG: {part}\n{text}" for part, text in parts.items())
 
 
-def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, path: Path) -> None:
+def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, several: bool, path: Path) -> None:
     try:
         from mcap_ros2.writer import Writer
     except ImportError:
@@ -234,7 +256,6 @@ def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, path: P
     if scenario is None and "scenarios" not in whole.attrs:
         raise InputError("result: does not hold its scenarios; mrctl export STORE --to mcap finds those of a sweep")
     held = dict(zip(whole["run"].values.tolist(), scenarios_of(whole), strict=True)) if scenario is None else {}
-    several = whole.sizes["run"] > 1
     with open(path, "wb") as file, Writer(file) as writer:
         writer.add_metadata("mrctl", {name: str(value) for name, value in whole.attrs.items()})
         schemas = {name: writer.register_msgdef(name, _definition(name)) for name in MESSAGES}

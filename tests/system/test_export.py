@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import sys
 from itertools import islice
 from pathlib import Path
@@ -302,6 +303,34 @@ def test_sweep(tmp_path):
         export(signals, "mcap", tmp_path / "none.mcap")
     with pytest.raises(InputError, match="holds metrics only"):
         export(mrctl.open(tmp_path / "metrics"), "csv", tmp_path / "none.csv")
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("kind", ["mcap", "csv", "parquet", "npz"])
+def test_sweep_with_impossible_draws(tmp_path, capsys, kind):
+    """A run that did not drive is left out of what is written and counted, and is named; alone it says why."""
+    mass = {"field": "perturbation.mass_factor", "normal": [0.5, 0.5]}
+    sweep = {"base": SHORT.model_dump(), "runs": 4, "axes": [mass], "record": "decimated"}
+    one, store, out = Sweep.from_dict(sweep), str(tmp_path / "store"), tmp_path / f"out.{kind}"
+    assert [run for run in range(4) if one.valid(run) is None] == [1]
+    jobs.run(one, store, workers=1)
+    words = ["export", store, "--to", kind, "--out", str(out)]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert said.out == f"{out}: 3 runs\n" and said.err == "mrctl: run: 1 did not drive; left out\n"
+    if kind == "mcap":
+        assert {topic.split("/")[1] for topic in messages(out)} == {"run0", "run2", "run3"}
+    elif kind == "parquet":
+        assert set(pd.read_parquet(out)["run"]) == {0, 2, 3}
+    out.unlink()
+    assert main([*words, "--run", "1"]) == 2
+    assert "result: holds no run that drove; run 1: perturbation.mass_factor: Input" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "store" / "signals.zarr" / "signals" / "c")
+    with pytest.warns(UserWarning, match="missing; runs 0 to 3 are left out"):
+        lost = mrctl.open(store)
+    with pytest.raises(InputError, match=r"^result: holds no run$"):
+        export(lost, kind, out)
+    assert not out.exists()
 
 
 def test_older(result, tmp_path):
