@@ -97,6 +97,8 @@ def control_period(result: xr.Dataset) -> float:
 def laps_of(run: xr.Dataset) -> Laps:
     """Divides one run (no `run` dimension) into whole laps; a run to a goal, or one shorter than a lap, counts as one.
 
+    A run of a sweep that did not drive has none.
+
     Samples after the last whole lap are left out, but a failure among them counts as one in that lap.
 
     Raises:
@@ -105,6 +107,8 @@ def laps_of(run: xr.Dataset) -> Laps:
     period = control_period(run)
     alive = np.isfinite(run["x"].values)
     failed, samples = _failed(run), _end(run)
+    if "samples" in run.coords and not int(run["samples"]):  # a run of a sweep that did not drive
+        return Laps(np.zeros(1, np.intp), 0 if failed else None)
     lap = float(run["lap_time"]) / period if "lap_time" in run.coords else np.inf
     if lap < 1:
         raise InputError(f"lap_time: {lap * period:g} s is shorter than the control period of {period:g} s")
@@ -359,7 +363,8 @@ def over_laps(laps: xr.Dataset, metric: str) -> xr.DataArray:
     count = laps["laps"].values
     values = laps[metric].transpose("run", "lap").values
     there = np.arange(values.shape[1]) < count[:, None]
-    mean = np.square(np.where(there, values, 0.0)).sum(axis=1) / count
+    total = np.square(np.where(there, values, 0.0)).sum(axis=1)
+    mean = np.divide(total, count, out=np.full(len(count), np.nan), where=count > 0)  # none of a run that did not drive
     attrs = {"units": METRICS[metric][0], "long_name": f"{METRICS[metric][1]} over all laps"}
     return xr.DataArray(np.sqrt(mean), {"run": laps["run"].values}, ("run",), metric, attrs)
 

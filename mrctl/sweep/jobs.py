@@ -313,7 +313,8 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
             continue
         laps = metrics.per_lap(result)
         texts = {name: result[name].values for name in ("failure", *FAULTS)}
-        table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, **texts)
+        samples_kept = -(-result["samples"].values // sweep.stride)  # if the run lasts
+        table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, samples=samples_kept, **texts)
         if sweep.record == "laps":
             for name in metrics.METRICS:
                 table[f"{name}_per_lap"] = [v[:n] for v, n in zip(laps[name].values, laps["laps"].values, strict=True)]
@@ -338,6 +339,7 @@ def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str
         "steering": found.get("steering") or arranged(scenario).steering,
         "seed": valid.seed if valid else values["seed"],
         "laps": 0,
+        "samples": 0,
     }
     row |= {"failed": bool(failure), "failure": failure, "failure_time": 0.0 if failure else np.nan}
     return row | found | {axis.field: axis.cell(values[axis.field]) for axis in sweep.axes}

@@ -451,6 +451,7 @@ class Sweep(Record):
         for name, kind, unit in (
             ("label", pa.string(), ""), ("feedforward", pa.string(), ""), ("steering", pa.string(), ""),
             ("seed", pa.int64(), "1"), ("lap_time", pa.float64(), "s"), ("laps", pa.int64(), "1"),
+            ("samples", pa.int64(), "1"),
             ("failed", pa.bool_(), "1"), ("failure_time", pa.float64(), "s"), ("failure", pa.string(), ""),
             *((name, pa.string(), "") for name in FAULTS),
         ):  # fmt: skip

@@ -436,13 +436,14 @@ class Store:
 
         axes = [axis["field"] for axis in self.manifest["sweep"]["axes"]]
         coords = columns(["run", *axes, "label", "feedforward", "steering", "seed", "lap_time"])
+        coords |= columns(["samples"] if "samples" in frame else [])  # older versions did not write it
         outcome = columns(["failed", "failure", "failure_time", *(name for name in FAULTS if name in frame)])
         attrs = {name: json.dumps(self.manifest[name]) for name in ("sweep", "versions")}
         attrs |= {"control_period": self.manifest["control_period"], "unfinished": self.size - len(frame)}
         if self.manifest["sweep"]["record"] == "laps":
             number, found = _by_lap(frame)
             coords.pop("laps", None)  # `laps` may be an axis too
-            return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
+            return xr.Dataset(outcome | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
         self._check_size([], len(frame) * self.samples)
@@ -478,12 +479,14 @@ def _drove(frame: pd.DataFrame) -> NDArray[np.bool]:
 
 
 def _by_lap(frame: pd.DataFrame) -> tuple[NDArray[np.intp], dict[str, Any]]:
-    """Returns the numbers of the laps, `(laps,)`, and the metrics of every lap as variables, NaN beyond those of a run.
+    """Returns the numbers of the laps, `(laps,)`, and as variables how many each run has, and the metrics of every lap.
 
-    Metrics that an older version of mrctl did not compute are NaN.
+    Metrics are NaN beyond the laps of a run, and where an older version of mrctl did not compute them.
     """
-    number = np.arange(1, frame["laps"].to_numpy().max(initial=0) + 1)
-    found: dict[str, Any] = {}
+    one = next(name for name in frame if str(name).endswith("_per_lap"))
+    counts = frame[one].map(len).to_numpy(np.int64)  # the column `laps` may be that of an axis
+    number = np.arange(1, counts.max(initial=0) + 1)
+    found: dict[str, Any] = {"laps": ("run", counts)}
     for name, (unit, _) in METRICS.items():
         values = np.full((len(frame), len(number)), np.nan)
         column = f"{name}_per_lap"

@@ -1,5 +1,7 @@
 """Metrics against closed forms on made-up signals."""
 
+import warnings
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -317,6 +319,20 @@ def test_bad_input(call, field):
     with pytest.raises(InputError, match=rf"^{field}: .+") as caught:
         call(make())
     assert "\n" not in str(caught.value)
+
+
+def test_run_that_did_not_drive():
+    """Of a run of a sweep that drove nothing there are no laps, and no metric over all of them."""
+    result = make(runs=2, laps=2, v=1.0).assign_coords(samples=("run", [round(2 * LAP / DT), 0]))
+    for name in metrics.SAMPLED:
+        result[name][1] = np.nan
+    laps = metrics.per_lap(result.assign(failed=("run", [False, True])))
+    assert laps["laps"].values.tolist() == [2, 0] and laps["failed"].values.tolist() == [False, True]
+    with warnings.catch_warnings(action="error"):
+        over = metrics.over_laps(laps, "v_rmse")
+    assert over[0] == pytest.approx(1) and np.isnan(over[1])
+    table = metrics.summary(laps)
+    assert table["laps"].tolist() == [2, 0] and np.isnan(table["v_rmse"][1])
 
 
 def test_over_laps_and_excess():
