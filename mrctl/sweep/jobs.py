@@ -79,6 +79,7 @@ def run(
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
     if scheduler is not None:
         check_address(scheduler)
+    sweep.check_draws()
     sweep = _absolute(sweep)
     work, path = work or compute, Path(out).absolute()
     try:

@@ -23,10 +23,10 @@ import pyarrow as pa
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
-from mrctl.record import InputError, Record
+from mrctl.record import InputError, Record, printable
 from mrctl.results.dataset import FAULTS, SIGNALS
 from mrctl.results.metrics import METRICS
-from mrctl.scenario import FEEDFORWARDS, Scenario, feedforward_name
+from mrctl.scenario import FEEDFORWARDS, Scenario, feedforward_name, replicates
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
@@ -176,6 +176,9 @@ class Sweep(Record):
     """Axes that vary. Put those that split batches (learner, steering, world) first: large batches are fast."""
     runs: Annotated[int, Field(ge=1, le=100_000_000)] = 1
     """Number of draws of seed and distributions for each combination of the listed values."""
+    replicates: bool = False
+    """Whether the seed of each run also draws its robot, as `mrctl.replicates` does: mass, motors, friction, wheel
+    radii and slope differ a little from those that `base` and axes give. Otherwise it draws only start and noise."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of all draws."""
     record: Literal["metrics", "laps", "decimated", "full"] = "metrics"
@@ -222,6 +225,32 @@ class Sweep(Record):
         if self.record in ("decimated", "full") and kept > MAX_SIGNAL_BYTES:
             raise ValueError(f"record: {self.size:,} runs would keep {kept / 1e12:,.0f} TB of signals; keep metrics")
         return self
+
+    def check_draws(self) -> None:
+        """Refuses a seed without effect, and runs that would be exact copies but count as independent ones.
+
+        This is no part of the validation, because stores of older versions hold such sweeps.
+
+        Raises:
+            InputError: There is one of these; the message names the field.
+        """
+        if self.base.seed:
+            raise InputError("base.seed: has no effect, because each run gets its own; set seed, or an axis seed")
+        sets_seed = [
+            axis.field
+            for axis in self.axes
+            if axis.field == "seed" or any(axis.field == SCENARIO_FIELD and "seed" in value for value in axis.listed)
+        ]
+        if self.runs > 1 and sets_seed and all(axis.listed for axis in self.axes):
+            raise InputError(f"runs: the axis {sets_seed[0]} sets the seed, so that all {self.runs} draws are copies")
+        for group in self._dimensions:
+            seen = set()
+            for values in zip(*(self.axes[a].listed for a in group), strict=True):
+                key = json.dumps(values, sort_keys=True, default=str)
+                if key in seen:
+                    names = ", ".join(self.axes[a].field for a in group)
+                    raise InputError(f"{names}: a value is there twice, {printable(key[1:-1])}")
+                seen.add(key)
 
     def _check_controllers(self) -> None:
         """Refuses an axis of controllers beside something else that says what drives, or with ambiguous names."""
@@ -386,7 +415,8 @@ class Sweep(Record):
         Raises:
             InputError: There is no such run, or a value that was drawn for it is out of range.
         """
-        return self._assemble(self.values(run), f"run {run}")
+        one = self._assemble(self.values(run), f"run {run}")
+        return replicates(one, 1, one.seed)[0] if self.replicates else one
 
     def valid(self, run: int) -> Scenario | None:
         """Returns the scenario of one run, or None if a value that was drawn for it is out of range."""

@@ -102,7 +102,7 @@ def test_laps_beside_a_longer_run(tmp_path):
     after = per_lap(simulate([short, HEALTHY[0], long]).isel(time=slice(900, None)))  # the first two have ended
     assert after["position_rmse"].isnull().all() and after["failed"].values.tolist() == [True, False, True]
     axes = [{"field": "laps", "values": [2, 5]}]
-    jobs.run(Sweep.from_dict({"base": short.model_dump(), "axes": axes, "record": "laps"}), tmp_path, 1)
+    jobs.run(Sweep.from_dict({"base": short.replace(seed=0).model_dump(), "axes": axes, "record": "laps"}), tmp_path, 1)
     assert all(jobs.repeat(tmp_path, run).same for run in (0, 1))
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mrctl import PERTURBATIONS, Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep
+from mrctl import PERTURBATIONS, Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep, replicates
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import plan
 from mrctl.sweep import store as folder
@@ -187,6 +187,24 @@ def test_distributions(kind, parameters, expected):
     assert stats.kstest([v[MASS["field"]] for v in drawn(one)], expected.cdf).pvalue > 0.01
 
 
+@pytest.mark.parametrize(
+    "base",
+    [{"perturbation": "all"}, {"perturbation": "nominal", "events": [{"time": 0.1, "perturbation": {"payload": 3.0}}]}],
+)
+def test_replicates(base):
+    """They are those of `mrctl.replicates` for the seeds of the runs, pairs where an axis is paired."""
+    seeds = {"field": "seed", "values": [4, 5, 6]}
+    one = sweep(seeds, LAWS, base=BASE | base, replicates=True)
+    learners = [one.base.replace(learner=name) for name in LAWS["values"]]
+    expected = [replicates(scenario, 1, seed)[0] for seed in seeds["values"] for scenario in learners]
+    assert [one.scenario(run) for run in range(one.size)] == expected
+    assert expected[::3] == replicates(learners[0], 3, first=4) and Sweep.from_dict(one.model_dump(mode="json")) == one
+    pairs = sweep({**LAWS, "paired": True}, runs=2, base=BASE | base, replicates=True)
+    drawn = [pairs.scenario(run).perturbation for run in range(6)]
+    assert drawn[:2] == drawn[2:4] == drawn[4:] and drawn[0] != drawn[1]
+    assert drawn[1] == replicates(one.base, 1, pairs.scenario(1).seed)[0].perturbation
+
+
 # --- what is refused ------------------------------------------------------------------------------
 
 
@@ -255,6 +273,40 @@ def test_refused(message, axes, changes):
     with pytest.raises(InputError, match=f"^s.toml: .*{message}") as error:
         sweep(*axes, **changes)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("message", "axes", "changes"),
+    [
+        ("base.seed: has no effect", [LAWS], {"base": {**BASE, "seed": 5}}),
+        (
+            "runs: the axis seed sets the seed, so that all 4 draws are copies",
+            [axis("seed", values=[1, 2])],
+            {"runs": 4},
+        ),
+        ("runs: the axis scenario sets", [axis("scenario", values=[{"seed": 1}, {"seed": 2}])], {"runs": 2}),
+        ("seed: a value is there twice, 1$", [axis("seed", values=[1, 2, 1])], {}),
+        ("laps: a value is there twice", [axis("laps", values=[1, 1])], {}),
+        ("perturbation.slope: a value is there twice", [axis("perturbation.slope", grid=grid(0.1, 0.1, 2))], {}),
+        (
+            "laps, learner: a value is there twice",
+            [axis("laps", values=[1, 1], zip="a"), axis("learner", values=["fel", "fel"], zip="a")],
+            {},
+        ),
+    ],
+)
+def test_copies(message, axes, changes):
+    """Runs that are exact copies, and a seed that nobody uses, are refused before a sweep begins."""
+    with pytest.raises(InputError, match=f"^{message}"):
+        sweep(*axes, **changes).check_draws()
+
+
+def test_no_copies():
+    """Draws, and zipped axes, make runs that differ."""
+    sweep(axis("seed", values=[1, 2]), MASS, runs=2).check_draws()
+    zipped = [axis("laps", values=[1, 1, 2], zip="a"), axis("perturbation.slope", values=[0.0, 0.1, 0.0], zip="a")]
+    sweep(*zipped, runs=2, seed=3).check_draws()
+    Sweep.of([Scenario(seed=seed) for seed in range(3)]).check_draws()
 
 
 def test_many_values_are_checked_fast(capsys, monkeypatch):
