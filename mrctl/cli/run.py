@@ -63,8 +63,7 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
         warn_if_impossible(scenario)
         found = single.run(scenario, out, json, controller)
         show(found, out, json)
-        if found.ended:
-            raise Incomplete(f"the run failed {found.ended}")
+        _expect_end(found.ended)
 
     return with_fields(run, default, explained(arguments))
 
@@ -85,6 +84,13 @@ def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json
     found, departs = single.repeat(folder, out, json, controller)
     show(found, out, json)
     expect_same(folder, departs, json)
+    _expect_end(found.ended)
+
+
+def _expect_end(ended: str) -> None:
+    """Fails the command if the run failed; the text says when and why."""
+    if ended:
+        raise Incomplete(f"the run failed {ended}")
 
 
 def _repeat(
@@ -101,10 +107,14 @@ def _repeat(
     from mrctl.sweep.store import Store
 
     jobs.stages_of(store, number, code)
+    jobs.check_files(store, number)
+    driven = None
     if out is not None or json:
         sweep = jobs.sweep_of(Store(store))
-        show(single.run(sweep.scenario(number), out, json, sweep.driven_by(number), sweep.hindsight), out, json)
-    repeated = jobs.repeat(store, number)
+        found = single.run(sweep.scenario(number), out, json, sweep.driven_by(number), sweep.hindsight)
+        show(found, out, json)
+        driven = found.result
+    repeated = jobs.repeat(store, number, driven)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:
         raise Incomplete(verdict)

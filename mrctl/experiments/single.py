@@ -106,8 +106,8 @@ def _report(scenario: Scenario, result: xr.Dataset, out: Path | None, as_json: b
     laps, run = metrics.per_lap(result), result.isel(run=0)
     reason = str(run["failure"].values)
     failure = f"after {float(run['failure_time']):.2f} s: {reason}" if reason else ""
-    describe = _as_json if as_json else _as_text
-    return Report(describe(scenario, run, laps.isel(run=0), own, failure), failure, partial(_save, result, laps, out))
+    text = (_as_json if as_json else _as_text)(scenario, run, laps.isel(run=0), own, failure)
+    return Report(text, failure, partial(_save, result, laps, out), result)
 
 
 def _as_json(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | None, failure: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
@@ -61,6 +62,8 @@ class Report(NamedTuple):
     """Of `navigate` the outcome of the first robot; of `run` when and why it failed, or ""; else ""."""
     save: Callable[[], None]
     """Writes the files; does nothing where the command writes none."""
+    result: xr.Dataset | None = None
+    """Result of `run`, which `mrctl.save` saves."""
 
 
 def frame(rows: Sequence[Sequence[str]], header: Sequence[str]) -> pd.DataFrame:

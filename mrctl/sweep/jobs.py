@@ -25,6 +25,7 @@ from mrctl.loop import user_files
 from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.simulation import Simulation, arranged, cores, simulate, titles
 from mrctl.physics import mjcf
+from mrctl.physics.files import robot_path, world_path
 from mrctl.record import InputError, printable, read_file
 from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
@@ -285,8 +286,17 @@ def driver(sweep: Sweep, stages: Stages) -> Callable[..., xr.Dataset]:
     return best_fixed if sweep.hindsight else partial(simulate, **stages)
 
 
-def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict[str, Any]], NDArray | None]:
-    """Drives runs; returns their rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
+def _compute(
+    sweep: Sweep, runs: Sequence[int], samples: int, driven: xr.Dataset | None = None
+) -> tuple[list[dict[str, Any]], NDArray | None]:
+    """Drives runs; returns their rows of the table, and signals `(runs, samples, signals)` if the store keeps them.
+
+    Args:
+        sweep: The sweep.
+        runs: Numbers of the runs.
+        samples: Number of samples of a run that the store keeps.
+        driven: Result of a single run, which is then not driven again.
+    """
     rows: dict[int, dict[str, Any]] = {}
     signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
     batches: dict[tuple[str | None, float], dict[int, Scenario]] = {}
@@ -300,7 +310,7 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
     for own, batch in queue:
         drive = driver(sweep, user_files.load(own) if own else {})
         try:
-            result = drive(list(batch.values()), threads=1)
+            result = drive(list(batch.values()), threads=1) if driven is None else driven
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}
@@ -403,12 +413,36 @@ def sweep_of(store: Store) -> Sweep:
     return Sweep.from_dict(store.manifest["sweep"], f"{store.path} (written by mrctl {store.writer})")
 
 
-def repeat(out: str | Path, run: int) -> Repeat:
-    """Repeats one run of a sweep alone and compares it with the store.
+def check_files(out: str | Path, run: int) -> None:
+    """Refuses one run of a stored sweep if its world, its robot or what its learner starts from is not there.
 
     Raises:
-        InputError: As `scenario_of`, or the run is not done yet or was set aside.
+        InputError: A file is missing, or what the learner starts from has changed; the message names the file.
     """
+    store = Store(out)
+    if (scenario := sweep_of(store).valid(run)) is None:
+        return
+    world_path(scenario.world)
+    if scenario.robot != CAR:
+        robot_path(scenario.robot)
+    files = filter(None, (scenario.learned, scenario.fel.weights))
+    for file, digest in _digests(files).items():
+        if store.manifest["models"].get(file, digest) != digest:
+            raise InputError(f"{file}: has changed since {out} was computed")
+
+
+def repeat(out: str | Path, run: int, driven: xr.Dataset | None = None) -> Repeat:
+    """Repeats one run of a sweep alone and compares it with the store.
+
+    Args:
+        out: The store.
+        run: Number of the run.
+        driven: Result of this run, where it has been driven already.
+
+    Raises:
+        InputError: As `scenario_of` and `check_files`, or the run is not done yet or was set aside.
+    """
+    check_files(out, run)
     store = Store(out)
     sweep = sweep_of(store)
     sweep.values(run)  # raises an error if there is no such run
@@ -416,7 +450,7 @@ def repeat(out: str | Path, run: int) -> Repeat:
         raise InputError(f"run: {run} is not done yet")
     if stored["failure"].startswith(SET_ASIDE):
         raise InputError(f"run: {run} was {stored['failure']}; there is nothing to compare with")
-    (row,), signals = _compute(sweep, [run], store.samples)
+    (row,), signals = _compute(sweep, [run], store.samples, driven)
     reasons = [one["failure"] or "it finished" for one in (row, stored)]
     writers = "" if store.writer == __version__ else f" (of mrctl {store.writer}; this is mrctl {__version__})"
     if reasons[0] != reasons[1]:

@@ -189,17 +189,20 @@ def test_saved_run_again(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypa
 def test_saved_results_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """So is a result that Python saved, of one run, a named one, one that fails, or one with events."""
     course = mrctl.Circle(radius=0.5, period=5.0)
-    tall = mrctl.Perturbation(payload=20.0, payload_z=0.5)
+    over = mrctl.Event(time=0.5, push=(4000.0, 4000.0, 0.0))
     runs = [
         mrctl.Scenario(name="mine", laps=1, reference=course, learner="rls"),
         mrctl.Scenario(laps=1, reference=course, events=(mrctl.Event(time=1.0, push=(3.0, 0.0, 0.0)),)),
-        mrctl.Scenario(laps=1, perturbation=tall, learner="none"),
+        mrctl.Scenario(laps=1, reference=course, events=(over,), learner="none"),
     ]
     for k, scenario in enumerate(runs):
         folder = tmp_path / f"{k}"
-        mrctl.save(mrctl.simulate(scenario), folder)
-        assert cli.main(["run", str(folder)]) == 0
-        assert f"{folder}: bit-identical" in capsys.readouterr().out
+        saved = mrctl.simulate(scenario)
+        mrctl.save(saved, folder)
+        assert cli.main(["run", str(folder)]) == bool(saved["failed"])
+        said = capsys.readouterr()
+        assert f"{folder}: bit-identical" in said.out
+        assert (f"mrctl: the run failed after {saved['failure_time'].item():.2f} s" in said.err) == (k == 2)
 
 
 def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -29,6 +29,7 @@ import xarray as xr
 import mrctl
 from mrctl import InputError, Sweep, cli
 from mrctl.loop.simulation import simulate
+from mrctl.physics.files import models_folder
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 from mrctl.sweep.jobs import compute
@@ -265,6 +266,29 @@ def test_run_again(sweep, store, tmp_path, capsys):
     assert "run: 24 is not in 0 to 23" in refused(capsys, "run", store, "--run", 24)
     assert "give its number with --run" in refused(capsys, "run", store)
     assert "not a sweep's store" in refused(capsys, "run", tmp_path, "--run", 1)
+
+
+@HERE
+@pytest.mark.usefixtures("no_figures")
+def test_run_again_needs_its_files(tmp_path, capsys):
+    """A file that is missing or has changed is no departure; with --out a run is driven once."""
+    world, file, store = tmp_path / "flat.xml", tmp_path / "l.safetensors", tmp_path / "store"
+    shutil.copytree(models_folder(), tmp_path, dirs_exist_ok=True)
+    learned(file, 0)
+    base = {"learner": "fel", "laps": 1, "reference": {"kind": "line", "length": 0.4}, "learned": str(file)}
+    jobs.run(Sweep.from_dict({"base": base | {"world": str(world)}, "runs": 2}), store, 1)
+    with mock.patch("mrctl.experiments.single.simulate", wraps=simulate) as once:
+        with mock.patch("mrctl.sweep.jobs.simulate", side_effect=AssertionError):
+            assert cli.main(["run", str(store), "--run", "1", "--out", str(tmp_path / "out")]) == 0
+    assert once.call_count == 1 and "run 1: bit-identical" in capsys.readouterr().out
+    kept = file.read_bytes()
+    learned(file, 1)
+    assert f"{file}: has changed since {store} was computed" in refused(capsys, "run", store, "--run", 1)
+    file.unlink()
+    assert f"{file}: No such file" in refused(capsys, "run", store, "--run", 1)
+    file.write_bytes(kept)
+    world.unlink()
+    assert f"no file {world}" in refused(capsys, "run", store, "--run", 1)
 
 
 # --- refusals -------------------------------------------------------------------------------------
