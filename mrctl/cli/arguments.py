@@ -157,10 +157,12 @@ def one_line(box: str, command: str) -> str:
     if match := re.match(r"Unrecognized options: (-[^\s,=]+)", text):
         flag, similar = "", []
         for line in lines:
-            flag = line.split()[0] if line.startswith("--") else flag
+            flag = line.split()[0].rstrip(",") if line.startswith("--") else flag  # a switch has two, --on, --no-on
             if line.startswith(f"in mrctl {command} "):
                 similar.append(flag)
-        meant = nearest(match[1], similar)
+        # Of flags that end alike tyro lists first the one of the reference that is chosen.
+        inner = [flag for flag in similar if flag.endswith(f".{match[1].removeprefix('--')}")]
+        meant = inner[0] if inner else nearest(match[1], similar)
         return f"no flag is called {match[1]}" + (f"; did you mean {meant}?" if meant else "")
     if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
         if match[3]:

@@ -34,10 +34,12 @@ def sweep(
     from mrctl.sweep.plan import Sweep
 
     report = jobs.run(Sweep.from_toml(file), out, workers, scheduler, progress=True)
-    print(f"{report.runs} runs, {report.failed} failed; table: {out / 'runs.parquet'}")
+    count = "1 run" if report.runs == 1 else f"{report.runs} runs"
+    print(f"{count}, {report.failed} failed; table: {out / 'runs.parquet'}")
     if report.aside:
         lost = "; ".join(f"runs {runs[0]} to {runs[-1]} ({why})" for runs, why in list(report.aside.items())[:5])
-        raise Incomplete(f"{len(report.aside)} jobs set aside: {lost}; the same command tries them again")
+        what = "1 job" if len(report.aside) == 1 else f"{len(report.aside)} jobs"
+        raise Incomplete(f"{what} set aside: {lost}; the same command tries them again")
 
 
 def suite(
@@ -75,7 +77,7 @@ def suite(
     """
     check_workers(workers)
     if seeds is not None and seeds < 1:
-        raise InputError("seeds: the suite needs at least one run of at least one feedforward")
+        raise InputError(f"seeds: {seeds} is below 1")
     if random is not None and random < 0:
         raise InputError(f"random: {random} is below 0")
     if quick + full + (held_out is not None) > 1:

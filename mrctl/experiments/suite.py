@@ -81,10 +81,14 @@ def suite(
         InputError: There is no feedforward or no seed, a controller is bad, or the folder cannot be written or holds
             other runs.
     """
-    if seeds < 1 or random < 0 or not (feedforwards or controllers):
-        raise InputError("seeds: the suite needs at least one run of at least one feedforward")
-    if max(seeds, random) > len(SUITE_SEEDS):
-        raise InputError(f"seeds: the suite has the first {len(SUITE_SEEDS):,}; the others are for tuning and held out")
+    if not (feedforwards or controllers):
+        raise InputError("feedforward: the suite needs at least one, or a controller")
+    for name, count, least in (("seeds", seeds, 1), ("random", random, 0)):
+        if count < least:
+            raise InputError(f"{name}: {count} is below {least}")
+        if count > len(SUITE_SEEDS):
+            most = f"{len(SUITE_SEEDS):,}"
+            raise InputError(f"{name}: the suite has the first {most} seeds; the others are for tuning and held out")
     choices = by_name(feedforwards, controllers)
     with output_folder(out):
         chosen = cases(mode, seeds, random)

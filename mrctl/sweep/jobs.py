@@ -105,7 +105,9 @@ def run(
             failed = _failed([store.table])
             return SweepReport(store.size, failed, {store.runs(job): why for job, why in sorted(aside.items())})
     except OSError as error:
-        raise InputError(f"{out}: {error.strerror or error}; what was done is kept") from None
+        done = any([*path.glob("parts/[0-9]*.parquet"), *path.glob("runs.parquet")])
+        kept = "; what was done is kept" if done else ""
+        raise InputError(f"{out}: {error.strerror or error}{kept}") from None
 
 
 def _absolute(sweep: Sweep) -> Sweep:

@@ -247,7 +247,7 @@ class Sweep(Record):
             seen = set()
             for values in zip(*(self.axes[a].listed for a in group), strict=True):
                 key = json.dumps(values, sort_keys=True, default=str)
-                if key in seen:
+                if key in seen and SCENARIO_FIELD not in sets_seed:  # a list of scenarios may have one twice
                     names = ", ".join(self.axes[a].field for a in group)
                     raise InputError(f"{names}: a value is there twice, {printable(key[1:-1])}")
                 seen.add(key)

@@ -305,6 +305,14 @@ def test_sweep_of_another_processor(file, tmp_path, whole):
     assert content(begun.path) == whole
 
 
+@HERE
+def test_one_run_is_no_runs(file, tmp_path, capsys):
+    """The command counts in words."""
+    file.write_text('[base]\nlaps = 1\nlearner = "none"\nreference = { kind = "line", length = 0.4 }\n')
+    assert cli.main(["sweep", str(file), "--out", str(tmp_path / "store")]) == 0
+    assert capsys.readouterr().out.startswith("1 run, 0 failed; table: ")
+
+
 def test_changed_sweep(file, store, capsys, whole):
     """A store goes on only with the file and the versions that began it."""
     file.write_text(FILE.replace("runs = 12", "runs = 13"))
@@ -489,6 +497,7 @@ def test_bad_input(file, tmp_path, capsys):
     store = tmp_path / "store"
     assert "no such file" in refused(capsys, "sweep", tmp_path / "none.toml", "--out", store).lower()
     assert "workers: 0" in refused(capsys, "sweep", file, "--out", store, "--workers", 0)
+    assert refused(capsys, "sweep", file, "--out", "/proc/zz") == "mrctl: /proc/zz: No such file or directory"
     assert "workers: not together" in refused(
         capsys, "sweep", file, "--out", store, "--workers", 1, "--scheduler", "tcp://127.0.0.1:1"
     )
@@ -542,7 +551,7 @@ def test_poison(file, sweep, tmp_path, finished, whole, capsys):
     assert report.failed == len({*failures(sweep), *range(5, 10)})
     with mock.patch("mrctl.sweep.jobs.compute", poisoned):
         message = refused(capsys, "sweep", file, "--out", store, status=1)
-    assert "1 jobs set aside: runs 5 to 9 (its worker died (signal 9))" in message
+    assert "1 job set aside: runs 5 to 9 (its worker died (signal 9))" in message
     table = pd.read_parquet(store / "runs.parquet")
     assert set(table["failure"][5:10]) == {"set aside: its worker died (signal 9)"} and table["failed"][5:10].all()
     opened = mrctl.open(store)
