@@ -284,7 +284,7 @@ def interval(error: Row) -> str:
     """Returns a mean in thousandths with its interval, with the digits that the floor leaves, or three without a floor.
 
     Where the ends of the interval would then be the same, they get more digits without a floor; with one, they are
-    rounded to the outside.
+    rounded to the outside. – stands for an end that is infinite, as of a median of few runs.
     """
     if not error["samples"]:
         return "–"
@@ -292,6 +292,9 @@ def interval(error: Row) -> str:
     step = _step(error)
     if not high > low:
         return _resolved(value, step)
+    if not np.isfinite(high - low):
+        ends = (_resolved(end, step) if np.isfinite(end) else "–" for end in (low, high))
+        return f"{_resolved(value, step)} [{', '.join(ends)}]"
     if _resolved(low, step) != _resolved(high, step):
         return f"{_resolved(value, step)} [{_resolved(low, step)}, {_resolved(high, step)}]"
     if step:

@@ -92,10 +92,11 @@ def word_of(wins: Superiority, better: str, worse: str) -> str:
 def centre_cell(samples: Array, digits: int, median: bool = False) -> str:
     """Returns the mean or the median of the finite samples with its 95 % interval, as from `bootstrap_interval`.
 
-    One sample has no interval, and – stands for none.
+    The mean of one sample has no interval; – stands for no value, and for an end that is infinite.
     """
     value, low, high, *_ = bootstrap_interval(samples, median=median)
-    interval = f" [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(low) else ""
+    ends = (f"{end:.{digits}f}" if np.isfinite(end) else "–" for end in (low, high))
+    interval = "" if np.isnan(low) else f" [{', '.join(ends)}]"
     return f"{value:.{digits}f}{interval}" if np.isfinite(value) else "–"
 
 

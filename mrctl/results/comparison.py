@@ -7,7 +7,6 @@ counted and lose every comparison.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -62,7 +61,8 @@ def bootstrap_interval(
     """Returns the mean of the finite samples with its confidence interval.
 
     It is the bias-corrected, accelerated bootstrap interval (Efron, 1987), or for the mean of fewer than ten samples
-    Student's, because the bootstrap would be too narrow.
+    Student's, because the bootstrap would be too narrow. That of the median is between two order statistics, as by
+    `quantile_interval`, because the bootstrap would be too narrow for any number of samples.
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.
@@ -72,15 +72,16 @@ def bootstrap_interval(
         median: Whether to take the median instead, which no single sample dominates.
 
     Returns:
-        The interval; its ends are NaN where fewer than two samples are finite, because one run does not show the
-        spread.
+        The interval; the ends of a mean are NaN where fewer than two samples are finite, because one run does not show
+        the spread, and those of a median are infinite where there are too few: at 95 % with fewer than six.
     """
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
-    statistic = np.median if median else np.mean
-    value = float(statistic(finite)) if len(finite) else np.nan
-    if median or len(finite) >= MIN_BOOTSTRAP:
-        low, high = _interval((finite,), statistic, level, n, seed)
+    value = float((np.median if median else np.mean)(finite)) if len(finite) else np.nan
+    if median:
+        low, high = quantile_interval(finite, 0.5, level)[1:3]
+    elif len(finite) >= MIN_BOOTSTRAP:
+        low, high = _bootstrapped(finite, level, n, seed)
     else:
         low, high = _student(finite, level)
     return Interval(value, low, high, len(finite), len(values) - len(finite))
@@ -256,20 +257,17 @@ def _check_share(share: float) -> None:
         raise InputError(f"share: {share} is not above 0 and at most 1")
 
 
-def _interval(
-    data: tuple[Array, ...], statistic: Callable[..., ArrayLike], level: float, n: int, seed: int
-) -> tuple[float, float]:
-    """Returns the BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
+def _bootstrapped(samples: Array, level: float, n: int, seed: int) -> tuple[float, float]:
+    """Returns the BCa bootstrap interval of a mean; percentiles where the samples are too alike for BCa."""
     from scipy.stats import bootstrap  # the import takes 0.4 s
 
     _check_level(level)
-    if len(data[0]) < 2:
-        return np.nan, np.nan
+    low = high = np.nan
     for method in ("BCa", "percentile"):
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             found = bootstrap(
-                data, statistic, n_resamples=n, batch=1000, vectorized=True, paired=True, confidence_level=level,
+                (samples,), np.mean, n_resamples=n, batch=1000, vectorized=True, confidence_level=level,
                 method=method, rng=np.random.default_rng(seed),
             ).confidence_interval  # fmt: skip
         low, high = float(found.low), float(found.high)

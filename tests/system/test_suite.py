@@ -293,7 +293,8 @@ def test_sentences() -> None:
 @pytest.mark.parametrize(
     ("value", "low", "high", "text"),
     [(6.5e-4, 6.4e-4, 6.6e-4, "0.650 [0.640, 0.660]"), (6.5e-4, 6.5e-4, 6.5e-4, "0.650"),
-     (6.5e-4, 6.49996e-4, 6.50004e-4, "0.650000 [0.649996, 0.650004]"), (1e-3, np.nan, np.nan, "1.00")],
+     (6.5e-4, 6.49996e-4, 6.50004e-4, "0.650000 [0.649996, 0.650004]"), (1e-3, np.nan, np.nan, "1.00"),
+     (1e-3, -np.inf, np.inf, "1.00 [–, –]")],
 )  # fmt: skip
 def test_interval(value: float, low: float, high: float, text: str) -> None:
     """No interval is printed with equal ends."""

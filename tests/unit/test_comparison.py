@@ -24,8 +24,17 @@ def test_bootstrap_normal():
 
 def test_median():
     """One run that went far wrong moves the mean and not the median, nor its interval."""
-    found = comparison.bootstrap_interval([1, 2, 3, 4, 5, 6, 700], median=True)
-    assert found.value == 4 and 1 <= found.low < 4 < found.high <= 6
+    found = comparison.bootstrap_interval([1, 2, 3, 4, 5, 6, 7, 8, 700, np.nan], median=True)
+    assert found == (5, 2, 8, 9, 1)
+
+
+@pytest.mark.parametrize("n", [4, 6, 10, 30])
+def test_median_coverage(n):
+    """At least 95 % of the intervals hold the median of a skew distribution, of few samples too."""
+    draws = np.random.default_rng(5).lognormal(0, 0.6, (1000, n))
+    found = [comparison.bootstrap_interval(d, median=True) for d in draws]
+    assert np.mean([one.low <= 1 <= one.high for one in found]) >= 0.95
+    assert all(np.isfinite([one.low, one.high]).all() == (n > 5) for one in found)
 
 
 def test_bootstrap_coverage():

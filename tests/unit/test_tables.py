@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mrctl import InputError
-from mrctl.experiments.tables import output_folder
+from mrctl.experiments.tables import centre_cell, output_folder
 
 
 def test_refused_command_leaves_nothing(tmp_path: Path) -> None:
@@ -31,6 +32,13 @@ def test_what_exists_is_kept(tmp_path: Path) -> None:
     with output_folder(tmp_path, ["x"]):
         pass
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {".writable": "mine", "table.json": "mine"}
+
+
+def test_centre_cell() -> None:
+    """An end of a median's interval is a number or, with too few samples, –; one sample's mean has no interval."""
+    assert centre_cell(np.arange(9.0), 1, median=True) == "4.0 [1.0, 7.0]"
+    assert centre_cell(np.arange(3.0), 1, median=True) == "1.0 [–, –]"
+    assert centre_cell(np.array([2.0]), 1) == "2.0" and centre_cell(np.array([np.nan]), 1, median=True) == "–"
 
 
 def test_no_folder() -> None:
