@@ -23,7 +23,7 @@ from mrctl.navigation.plan import Plan
 from mrctl.navigation.steer import CHECK_SPACING, MAX_PIECES, Curve, advance, sample, shortest, steer
 from mrctl.record import InputError
 from mrctl.theory.clearance import clearance, cover, gap, point_to_polygon
-from mrctl.theory.grid import Field, field_of, value
+from mrctl.theory.grid import Field, near_field, value
 from mrctl.theory.obstacles import Outlines
 
 HEADINGS = 72
@@ -36,6 +36,8 @@ HEURISTIC_WEIGHT = 1.04  # of the heuristic, and so about the most by which a pl
 # share of the free part of a shortest path that hits something, after which another one is tried; chosen
 RETRY_SHARE = 0.5
 HEURISTIC_SLACK = 2.0  # cells, by which the way around the obstacles may be too long
+NEAR_WAY = 0.9  # share of that way below which shortcuts are not tried; in narrow bends the way is 4 % too long
+LONGEST_SKIP = 1.0  # m, about the longest part of an arc in the open on which no pose is looked at; chosen
 MAX_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, and three times that with reversing
 
 
@@ -118,7 +120,8 @@ def space(
     discs, sides = cover(footprint, FOOTPRINT_DISCS), np.hstack([footprint, np.roll(footprint, -1, axis=0)])
     depths = np.array([-point_to_polygon.compiled(x, y, sides) for x, y, _ in discs])
     reach = float(np.hypot(*footprint.T).max())
-    return Space(outlines, field_of(outlines, low, high, cell), footprint, discs, depths, reach, margin)
+    far = reach + margin + 2 * cell + LONGEST_SKIP  # beyond which nothing asks how far an obstacle is
+    return Space(outlines, near_field(outlines, low, high, cell, far), footprint, discs, depths, reach, margin)
 
 
 def wider(where: Space, goal: Array, room: float) -> Space:
@@ -186,7 +189,8 @@ def shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
     """Replaces detours of a plan, which the arcs of the search leave, by shortest paths that are free.
 
     From each pose the path goes to the farthest one to which there is a cheaper one, of those every 0.25 m. The result
-    is shortened once more, from its own poses.
+    is shortened once more, from its own poses. A path that is shorter than the way around the obstacles hits one; to
+    look where would take by far the most time of a long plan.
 
     Args:
         where: Obstacles and footprint, as the plan was made with.
@@ -194,18 +198,19 @@ def shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
         radius: Least turning radius in m.
         reverse: Whether the robot may reverse.
     """
+    ahead = cost_to_go(where, whole.poses[-1])
     for _ in range(2):
-        whole = _shortcut(where, whole, radius, reverse)
+        whole = _shortcut(where, whole, ahead, radius, reverse)
     return whole
 
 
-def _shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
-    """Does what `shortcut` describes, once."""
+def _shortcut(where: Space, whole: Plan, ahead: Array, radius: float, reverse: bool) -> Plan:
+    """Does what `shortcut` describes, once; `ahead` is what `cost_to_go` returns."""
     steps = np.hypot(*np.diff(whole.poses[:, :2], axis=0, prepend=whole.poses[:1, :2]).T) * whole.directions
     poses, directions, total, now, last = [whole.poses[:1]], [np.zeros(1)], 0.0, 0, 0.0
     cost = np.empty(len(steps))
     while now < len(steps) - 1:
-        other, found = farthest.compiled(whole.poses, steps, now, radius, reverse, last, where, cost)
+        other, found = farthest.compiled(whole.poses, steps, now, radius, reverse, last, where, ahead, cost)
         if other > now:
             curve = steer(whole.poses[now], whole.poses[other], radius, reverse)
             piece, direction = (column[1:] for column in sample(whole.poses[now], curve, radius, CHECK_SPACING))
@@ -220,8 +225,9 @@ def _shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
 
 @kernel
 def farthest(
-    poses: Array, steps: Array, now: int, radius: float, reverse: bool, last: float, where: Space, cost: Array
-) -> tuple[int, float]:
+    poses: Array, steps: Array, now: int, radius: float, reverse: bool, last: float, where: Space, ahead: Array,
+    cost: Array,
+) -> tuple[int, float]:  # fmt: skip
     """Looks for the farthest pose of a plan to which a shortest path is free and cheaper than the plan.
 
     Args:
@@ -232,6 +238,7 @@ def farthest(
         reverse: Whether the robot may reverse.
         last: Direction in which the robot came to that pose, as in `analytic_expansion`.
         where: Obstacles and footprint.
+        ahead: Way around the obstacles from each cell to the last pose in m, `(rows, columns)`.
         cost: Out: cost of the plan from that pose to each later one in m, `(n,)`.
 
     Returns:
@@ -245,11 +252,14 @@ def farthest(
             cost[k] += cost_of(steps[k], direction)
             direction = np.sign(steps[k])
     sides, end = np.empty((len(where.footprint), 4)), np.empty(3)
+    row, column, _ = cell_of(poses[now], where)
     for k in range(n - 1, now, -SHORTCUT_STRIDE):
+        i, j, _ = cell_of(poses[k], where)
+        least = NEAR_WAY * abs(ahead[row, column] - ahead[i, j]) - HEURISTIC_SLACK * where.field.resolution
         after = steps[k + 1] if k + 1 < n else 0.0  # the plan goes on with its first step after the path
         most = cost[k + 1] - cost_of(after, 0.0) if k + 1 < n else cost[k]
         found, direction, _ = analytic_expansion(
-            poses[now], poses[k], radius, reverse, last, most - 1e-6, where, sides, end
+            poses[now], poses[k], radius, reverse, last, least, most - 1e-6, where, sides, end
         )
         if found + cost_of(after, direction) - cost_of(after, 0.0) < most - 1e-6:
             return k, found
@@ -399,8 +409,8 @@ def cost_of(way: float, last: float) -> float:
 
 @kernel
 def analytic_expansion(
-    start: Array, goal: Array, radius: float, reverse: bool, last: float, most: float, where: Space, sides: Array,
-    end: Array,
+    start: Array, goal: Array, radius: float, reverse: bool, last: float, least: float, most: float, where: Space,
+    sides: Array, end: Array,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Tries the shortest path without obstacles from pose to pose.
 
@@ -410,6 +420,7 @@ def analytic_expansion(
         radius: Least turning radius in m.
         reverse: Whether the robot may reverse.
         last: Direction in which the robot came to the start: 1, −1, or 0 where it begins.
+        least: Length in m of the way around the obstacles: a shorter path hits one.
         most: Cost in m that it has to be below.
         where: Obstacles and footprint.
         sides: Scratch, `(n, 4)`.
@@ -421,12 +432,12 @@ def analytic_expansion(
     """
     turns, lengths = np.zeros(MAX_PIECES), np.zeros(MAX_PIECES)
     shortest(start, goal, radius, reverse, turns, lengths)
-    cost, direction, free = 0.0, last, 0.0
+    cost, direction, free, whole = 0.0, last, 0.0, 0.0
     for length in lengths:
         if length != 0.0:
             cost += cost_of(length, direction)
-            direction = np.sign(length)
-    if cost >= most:
+            direction, whole = np.sign(length), whole + abs(length)
+    if cost >= most or whole < least:
         return np.inf, direction, free
     now = start.copy()
     for k in range(MAX_PIECES):
@@ -517,7 +528,9 @@ def search(
             if not delayed and tree.costs[now] < tree.again[now]:
                 late.append(now)
             else:
-                cost, direction, free = analytic_expansion(pose, goal, radius, reverse, last, np.inf, where, sides, end)
+                cost, direction, free = analytic_expansion(
+                    pose, goal, radius, reverse, last, 0.0, np.inf, where, sides, end
+                )
                 tree.again[now] = tree.costs[now] + RETRY_SHARE * free
                 if cost < np.inf:
                     copy_pose(goal, tree.poses[n])

@@ -1,6 +1,7 @@
 """Hybrid A*: plans are free and can be driven, and cost no more than an exhaustive search of the same lattice finds."""
 
 from itertools import pairwise
+from time import thread_time
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from mrctl import Box, Disc, InputError, Limits, Obstacles, Scenario
 from mrctl.navigation import hybrid_astar, planning
 from mrctl.navigation.generators import Task, cellular, corridor, parking_bay
 from mrctl.navigation.hybrid_astar import NoWay, cost_to_go, plan, shortcut, space
+from mrctl.navigation.maps import Map
 from mrctl.navigation.plan import least_clearance, run_out
 from mrctl.navigation.planning import planned
 from mrctl.navigation.steer import sample, steer
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.clearance import clearance
+from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Surroundings, turned
 
 FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
@@ -73,6 +76,50 @@ def test_random_rooms(reverse):
         drivable(where, shorter, start, goal, reverse)
         assert shorter.cost <= found.cost + 1e-9
     assert plans >= 6
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_field(reverse):
+    """The field has no distances that the search does not need: plans have the bits that they have with all of them."""
+    random = np.random.default_rng(1)
+    for _ in range(4):
+        where = prepared(random_shapes(random, 5), cell=0.1)
+        whole = field_of(where.outlines, *where.area, 0.1)
+        far = where.field.distance.max()
+        assert np.array_equal(where.field.distance, np.minimum(whole.distance, far)) and far < whole.distance.max()
+        poses = random.uniform([-3.5, -3.5, -3], [3.5, 3.5, 3], (200, 3))
+        start, goal = [p for p in poses if clearance(FOOTPRINT, p, where.outlines) > 0.1][:2]
+        spaces = where, where._replace(field=whole)
+        found = [plan(one, start, goal, RADIUS, reverse) for one in spaces]
+        shorter = [shortcut(one, found[0], RADIUS, reverse) for one in spaces]
+        for a, b in (found, shorter):
+            assert np.array_equal(a.poses, b.poses) and a.cost == b.cost and a.expanded == b.expanded
+
+
+def seconds(work, *arguments):
+    """Returns what a function returns, and the time that it takes this thread in s."""
+    begun = thread_time()
+    return work(*arguments), thread_time() - begun
+
+
+def test_long_plan():
+    """On a map with many obstacles the shortcuts of a long plan take no more than some times as long as the search."""
+    cells = np.zeros((240, 240), bool)  # of 10 cm
+    cells[:2] = cells[-2:] = cells[:, :2] = cells[:, -2:] = True
+    for k in range(1, 6):  # rooms with doors at their ends in turn
+        cells[:, 40 * k : 40 * k + 2] = True
+        cells[slice(3, 15) if k % 2 else slice(225, 237), 40 * k : 40 * k + 2] = False
+    near = np.zeros_like(cells)
+    for rows, columns in np.ndindex(3, 3):
+        near |= np.roll(cells, (rows - 1, columns - 1), (0, 1))
+    cells |= near & (np.random.default_rng(0).random(cells.shape) < 0.35)  # rough walls, of many rectangles
+    outlines = Surroundings(Map(100 * cells.astype(np.int8), 0.1, np.zeros(3)).obstacles()).at(0.0)
+    start, goal, low, high = np.array([2.0, 12.0, 1.5]), np.array([22.0, 12.0, 1.5]), np.zeros(2), np.full(2, 24.0)
+    for _ in range(2):  # which compiles the functions
+        where = space(outlines, FOOTPRINT, low, high)
+        found, searches = seconds(plan, where, start, goal, RADIUS, False)
+        shorter, shortens = seconds(shortcut, where, found, RADIUS, False)
+    assert len(outlines.rings) > 500 and shorter.length > 100 and shortens < 15 * searches
 
 
 def test_parking():
