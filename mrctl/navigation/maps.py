@@ -129,9 +129,9 @@ def _pixels(path: Path) -> Array:
                 check_size(image.height, image.width, f"{path}: image")
                 if image.mode.startswith("I"):
                     return np.asarray(image, float)[..., None] / 257  # 16 bits
-                plain = image.mode if image.mode in ("L", "LA", "RGB", "RGBA") else None
-                colours = "RGBA" if image.has_transparency_data else "RGB"
-                image = image if plain else image.convert("L" if image.mode == "1" else colours)
+                if image.mode not in ("L", "RGB", "RGBA"):  # with transparency as a fourth channel, also beside grey
+                    colours = "RGBA" if image.has_transparency_data else "RGB"
+                    image = image.convert("L" if image.mode == "1" else colours)
                 return np.asarray(image, float).reshape(image.height, image.width, -1)
     except InputError:
         raise

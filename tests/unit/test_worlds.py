@@ -48,6 +48,16 @@ def test_transparency(tmp_path):
     assert read_map(written(tmp_path, "map.png", "scale", pixels=pixels)).occupancy.tolist() == [[72, -1]]
 
 
+def test_grey_with_transparency(tmp_path):
+    """A map in grey with an alpha channel has the walls that it has in colours with one."""
+    path = written(tmp_path, "map.png")
+    Image.fromarray(PICTURE).convert("LA").save(tmp_path / "map.png")
+    found = read_map(path).occupancy
+    assert found.tolist() == [[100, 0, 0, 100], [0, 0, -1, 100], [100, 100, 0, 0]]
+    Image.fromarray(PICTURE).convert("RGBA").save(tmp_path / "map.png")
+    assert np.array_equal(read_map(path).occupancy, found)
+
+
 def test_palette(tmp_path):
     """An image with a palette, as many programs save one, has no transparency that would brighten it."""
     grey = np.array([[80, 205, 255]], np.uint8)  # of which 80 is occupied, and 205 unknown
