@@ -282,8 +282,8 @@ def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
         series,
         title=chart.title,
         scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}, "event": {"range": (0.0, 1.0)}},
-        axes=({"size": 24, "ticks": {"size": 4}}, {"size": 56, "ticks": {"size": 4}}),
+        axes=({"size": 24, "ticks": {"size": 4}}, {"size": 56, "ticks": {"size": 4}, "space": 16}),  # px
         height=112,
-        padding=(8, 8, 0, 0),
+        padding=(8, 18, 0, 0),  # to the right for half of the last time
         cursor={"sync": {"key": "mrctl"}, "drag": {"x": zoom, "y": False}},
     )

@@ -59,7 +59,8 @@ class ReplayPage(Page):
             self.on(gui.add_button_group("", ("play", "pause", "start")), self._command)
             self.scrubber = gui.add_slider("Time, s", 0.0, 1.0, 0.01, 0.0)
             self.on(self.scrubber, self._scrub)
-            self._interval = gui.add_multi_slider("Curves, s", 0.0, 1.0, 0.01, (0.0, 1.0))
+            # Without marks: the page cuts off the last one, and the scrubber has the same.
+            self._interval = gui.add_multi_slider("Curves, s", 0.0, 1.0, 0.01, (0.0, 1.0), marks=())
             self.on(self._interval, lambda _: self._draw_curves())
             speeds = tuple(name for name, speed in SPEEDS.items() if np.isfinite(speed))
             self.on(gui.add_dropdown("Speed", speeds, initial_value="1×"), self.choose_speed)

@@ -73,7 +73,7 @@ class Robots:
         self.length = float(np.hypot(*(self.footprint[1] - self.footprint[0])))
         self._frames = [self._draw_robot(row) for row in range(self.size)]
         self._labels = [
-            scene.add_label(f"/world/label{row}", look.label, font_screen_scale=0.8)
+            scene.add_label(f"/world/label{row}", look.label, font_screen_scale=0.8, anchor="bottom-center")
             for row, look in enumerate(looks)
             if self.size > 1
         ]

@@ -661,6 +661,40 @@ def test_replay(browser, tmp_path):
         until(lambda: replay.runs == [0, 1], "it to be a ghost")
 
 
+# Of each chart, the number of numbers at its y axis, and how far its last time ends before its right edge in pixels.
+AXES_IN_VIEW = """() => {
+    const charts = Object.values(window.__viserTestpoints?.uplots ?? {}).map(({chart}) => chart);
+    if (!charts.length || charts.some(({axes}) => !axes[0]._values || !axes[1]._values)) return null;
+    return charts.map((chart) => {
+        const [across, up] = chart.axes, pen = document.createElement('canvas').getContext('2d');
+        pen.font = across.font[0];
+        const half = pen.measureText(across._values.at(-1)).width / window.devicePixelRatio / 2;
+        const middle = chart.bbox.left / window.devicePixelRatio + chart.valToPos(across._splits.at(-1), 'x');
+        return [up._values.filter((text) => text).length, chart.width - middle - half];
+    });
+}"""
+# How far the marks of sliders end before the right edge of the page in pixels.
+MARKS_IN_VIEW = """() => [...document.querySelectorAll('.mantine-Slider-markLabel')].map(
+    (mark) => window.innerWidth - mark.getBoundingClientRect().right
+)"""
+
+
+def test_numbers_in_view(browser, tmp_path):
+    """Each y axis has two numbers or more, and the page cuts off neither a time nor a mark of a slider."""
+    drive = BASE.replace(
+        reference=Circle(radius=0.8, period=10.02), laps=1, learner="none"
+    )  # the last time is at the edge
+    save(simulate(drive), tmp_path / "result.zarr")
+    with (
+        serving(lambda server: ReplayPage(Library(tmp_path / "result.zarr"), [0], server)) as (_, url),
+        visit(browser, url, slowly=True) as page,
+    ):
+        axes = until(lambda: page.evaluate(AXES_IN_VIEW), "the charts")
+        assert all(numbers >= 2 and room > 3 for numbers, room in axes), axes
+        marks = until(lambda: page.evaluate(MARKS_IN_VIEW) or None, "the marks")
+        assert min(marks) > 10, marks  # which is the margin of the inputs
+
+
 PLACES = """(name) => {
     const vertices = [], node = window.__viserMutable.nodeRefFromName[name];
     if (!node) return [];
