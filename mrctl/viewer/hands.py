@@ -129,7 +129,7 @@ class Hands:
         """Shows, and at the end sets, the goal at the start of a drag."""
         if self._waits == "goal":
             goal = (float(start[0]), float(start[1]), float(np.arctan2(*(end - start)[::-1])))
-            self._scene.navigation.show_ends(np.array([goal, goal]))
+            self._scene.navigation.show_ends([np.array([goal, goal])])
             if phase == "end":
                 self._finish(goal)
 
@@ -168,7 +168,7 @@ class Hands:
         if self._points:
             return self._finish(goal)
         self._points.append(point)
-        self._scene.navigation.show_ends(np.array([goal, goal]))
+        self._scene.navigation.show_ends([np.array([goal, goal])])
         self._picking.content = block("picking", "Click on the floor towards where they shall look there.")
 
     def _finish(self, goal: Pose) -> None:

@@ -243,7 +243,7 @@ class Live(Page):
         watch = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
         self._story.content = block("story", *watch) if watch else ""
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
-        self._scene.show_reference(first)
+        self._scene.show_references([first])
         self._scene.forget_trails()
         self._hands.begin(self._scene, session)
         self._controls.hide(
@@ -591,7 +591,7 @@ class Live(Page):
             if stopped and (reason := self.session.failure(row)):
                 lines.append(warning(f"{label} stopped: {reason}"))
         if self.session.tick:
-            lines += arrivals(self._labels, self._record(), self._ends)
+            lines += arrivals(self._labels, self._record(), [self._ends] * self.session.size)
         return lines
 
     def _lap(self) -> int:
@@ -642,7 +642,7 @@ class Live(Page):
         self._scene.show_events(driven[ticks[ticks >= 0]])
         soon = self.time + self.session.preview * self.session.period
         self._ends = ends(scenario, soon)
-        self._scene.navigation.show_ends(self._ends)
+        self._scene.navigation.show_ends([] if self._ends is None else [self._ends])
         way = followed(scenario, soon)
         if way != self._way and any(event.reference for event in self.session.added):
             self._way = way

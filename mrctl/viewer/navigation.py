@@ -45,13 +45,8 @@ class Navigation:
             height: Returns the height of the ground in m at x and y in m.
         """
         self._scene, self._height = scene, height
-        self._ends = [
-            add_mesh(
-                scene, f"/world/{name}", *ribbons(outline(footprint), OUTLINE_WIDTH),
-                color=colour, side="double", visible=False,
-            )
-            for name, colour in (("start", REFERENCE_COLOUR), ("goal", GOAL_COLOUR))
-        ]  # fmt: skip
+        self._outline = ribbons(outline(footprint), OUTLINE_WIDTH)
+        self._ends: list[viser.MeshHandle] = []  # start and goal in turn
         self._scans: list[viser.PointCloudHandle] = []
         for row, robot in enumerate(robots[:MAX_MARKED]):
             for kind, size in (("scan", POINT_SIZE), ("particles", PARTICLE_SIZE)):
@@ -81,12 +76,18 @@ class Navigation:
         """Draws a map that differs from the world, on top of the obstacles, as the outlines of what it has."""
         _show_segments(self._map, None if known is None else sides(Surroundings(known).at(0.0)), MAP_HEIGHT)
 
-    def show_ends(self, ends: Array | None) -> None:
-        """Draws outlines of a robot at its start and its goal, poses in m, m, rad, `(2, 3)`; None hides them."""
+    def show_ends(self, ends: Sequence[Array]) -> None:
+        """Draws outlines of a robot at starts and goals, pairs of poses in m, m, rad, `(2, 3)`, each pair once."""
+        poses = np.unique(np.reshape(ends, (-1, 2, 3)), axis=0).reshape(-1, 3)
+        for k in range(len(self._ends), len(poses)):
+            name, colour = ("goal", GOAL_COLOUR) if k % 2 else ("start", REFERENCE_COLOUR)
+            self._ends.append(
+                add_mesh(self._scene, f"/world/{name}/{k // 2}", *self._outline, color=colour, side="double")
+            )
         for k, mark in enumerate(self._ends):
-            mark.visible = ends is not None
-            if ends is not None:
-                x, y, theta = ends[k]
+            mark.visible = k < len(poses)
+            if mark.visible:
+                x, y, theta = poses[k]
                 mark.position, mark.wxyz = (x, y, self._height(x, y) + PATH_HEIGHT), quaternion(theta)
 
     def show_scans(self, scans: Sequence[tuple[Array, Array] | None]) -> None:

@@ -323,18 +323,19 @@ class Page(ABC):
             self._report_errors(request)
 
 
-def arrivals(labels: Sequence[str], now: Rows, ends: Array | None) -> list[str]:
+def arrivals(labels: Sequence[str], now: Rows, ends: Sequence[Array | None]) -> list[str]:
     """Returns a line of HTML for each robot that stands at the goal.
 
     Args:
         labels: Label of each robot.
         now: Record of `TICK` of each robot, `(B,)`.
-        ends: Start and goal, poses in m, m, rad, `(2, 3)`, or None.
+        ends: Start and goal of each robot, poses in m, m, rad, `(2, 3)`, or None.
     """
-    if ends is None:
-        return []
-    there = arrived(np.stack([now["x"], now["y"], now["theta"]], -1), now["v"], ends[1])
-    return [f"{html.escape(label)} has arrived" for label, at in zip(labels, there, strict=True) if at]
+    lines = []
+    for label, row, bounds in zip(labels, now, ends, strict=True):
+        if bounds is not None and arrived(np.array([row["x"], row["y"], row["theta"]]), row["v"], bounds[1]):
+            lines.append(f"{html.escape(label)} has arrived")
+    return lines
 
 
 def warning(text: str) -> str:

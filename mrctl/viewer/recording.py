@@ -29,6 +29,7 @@ from mrctl.sweep import jobs, store
 from mrctl.sweep.store import Store
 from mrctl.theory.obstacles import turned
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Reference
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
 
@@ -186,6 +187,12 @@ def event_times(recordings: Sequence[Recording]) -> list[float]:
     longest = max(r.duration for r in recordings)
     times = {event.time - r.start for r in recordings for event in r.scenario.events}
     return sorted(time for time in times if 0 <= time <= longest)
+
+
+def references_of(scenarios: Sequence[Scenario]) -> list[Reference]:
+    """Returns the references of scenarios and of their events, each once."""
+    found = [[s.reference, *(event.reference for event in s.events if event.reference)] for s in scenarios]
+    return list(dict.fromkeys(reference for references in found for reference in references))
 
 
 def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]:

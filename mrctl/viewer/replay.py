@@ -195,7 +195,8 @@ class ReplayPage(Page):
                 lines.append(warning(f"{r.label} stopped after {r.duration:.2f} s: {r.failure}"))
             lines += [warning(f"{r.label}: {fault}") for fault in r.faults]
         last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
-        lines += arrivals(self._labels, last, ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
+        bounds = [ends(recording.scenario, recording.start + self.time) for recording in self.recordings]
+        lines += arrivals(self._labels, last, bounds)
         row = self.library.table.loc[self.runs[0]]
         known = [_stated(str(column), value) for column, value in row.items() if isinstance(value, int | float)]
         lines += [line for line in known if line]

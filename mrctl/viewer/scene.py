@@ -29,7 +29,7 @@ from mrctl.viewer.cameras import OVERVIEW, TOP, fitted, to_see
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour, Look
 from mrctl.viewer.navigation import GOAL_COLOUR, Navigation
-from mrctl.viewer.recording import PATH_HEIGHT, Recording, event_times, joint_log, path
+from mrctl.viewer.recording import PATH_HEIGHT, Recording, event_times, joint_log, path, references_of
 from mrctl.viewer.robots import LAST_VISIBLE_GROUP, Dragged, Robots, in_order
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.server import Server
@@ -150,10 +150,10 @@ class Scene:
                 if model.body_mocapid[body] >= 0:
                     self._movers.append(drawn)
 
-    def show_reference(self, scenario: Scenario) -> None:
-        """Draws the map, and a lap of each reference of a scenario on the ground; turns the cameras to show them."""
-        self.navigation.show_map(scenario.map)
-        references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
+    def show_references(self, scenarios: Sequence[Scenario]) -> None:
+        """Draws the first one's map, and a lap of each reference on the ground; turns the cameras to show them."""
+        self.navigation.show_map(scenarios[0].map)
+        references = references_of(scenarios)
         lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
         self.draw_references(references)
@@ -257,7 +257,7 @@ class Scene:
             self._posts.remove()
             self._posts = None
         thick, posts = TARGET_LINE_WIDTH * self.length, []
-        for x, y in zip(rows["x_ref"], rows["y_ref"], strict=True):
+        for x, y in sorted(set(zip(rows["x_ref"].tolist(), rows["y_ref"].tolist(), strict=True))):
             if np.isfinite(x):
                 foot = np.array([x, y, self._height(x, y)])
                 posts.append(bar(foot, foot + [0, 0, self.length / 2], thick))
@@ -287,12 +287,13 @@ class Scene:
 
     def show_recordings(self, recordings: Sequence[Recording], magnified: int) -> None:
         """Draws the references and the paths of finished runs, with deviations `magnified` times."""
-        self.show_reference(recordings[0].scenario)
+        self.show_references([recording.scenario for recording in recordings])
         for row, recording in enumerate(recordings):
             self.robots.show(row, recording.qpos(len(recording.log) - 1))
         _, log, _ = joint_log(recordings)
         self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)], magnified)
-        self.show_events(log[[recordings[0].index(time) for time in event_times(recordings)], 0])
+        marked = [(r.index(time), row) for row, r in enumerate(recordings) for time in event_times([r])]
+        self.show_events(log[tuple(np.array(marked, int).reshape(-1, 2).T)])
 
     def show_moment(self, recordings: Sequence[Recording], time: float, magnified: int) -> None:
         """Shows finished runs at a time in s from their first samples, with deviations `magnified` times."""
@@ -300,9 +301,9 @@ class Scene:
             self.robots.show(row, recording.qpos(recording.index(time)))
             self.robots.show_payload(row, recording.perturbation(time))
             self.arrows.show_force(row, pushed(recording.scenario, recording.start + time))
-        first = recordings[0]
-        self.show_obstacles(first.start + time)
-        self.navigation.show_ends(ends(first.scenario, first.start + time))
+        self.show_obstacles(recordings[0].start + time)
+        found = [ends(recording.scenario, recording.start + time) for recording in recordings]
+        self.navigation.show_ends([bounds for bounds in found if bounds is not None])
         self.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
 
     def _height(self, x: float, y: float) -> float:

@@ -31,7 +31,7 @@ from mrctl.theory.obstacles import Surroundings
 from mrctl.viewer.cameras import MIN_VIEW, OVERVIEW, fitted, to_see
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
-from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path, references_of
 from mrctl.viewer.sensors import magnification
 
 Picture = NDArray[np.uint8]
@@ -121,7 +121,7 @@ def _pictures(
         raise InputError(f"record: MuJoCo cannot draw on this machine; is EGL (libegl1) installed? {reason}") from None
     with renderer:
         first = recordings[0].scenario
-        references = [first.reference, *(event.reference for event in first.events if event.reference)]
+        references = references_of([recording.scenario for recording in recordings])
         courses = [one.sample(np.linspace(0, one.period, LINE_POINTS)).pose * [1, 1, 0] for one in references]
         view = max(MIN_VIEW, *np.ptp(np.concatenate(courses), axis=0))
         camera = _overview(model, first, np.concatenate([*courses, *map(_driven, recordings)]), width / height)

@@ -115,6 +115,7 @@ def test_replay_of_a_mission(server, tmp_path):
         replay.draw()
         replay.refresh()
         assert replay._status.content.count("has arrived") == there
+    assert re.search(r"total variation of the voltage, both wheels: [\d.]+ V<", replay._status.content)
     start, goal = replay._scene.navigation._ends
     assert start.visible and start.position[:2] == pytest.approx([0, 0], abs=1e-9)
     assert goal.position[:2] == pytest.approx([1.5, -0.6]) and 2 * np.arcsin(goal.wxyz[3]) == pytest.approx(-0.5)
@@ -128,6 +129,35 @@ def test_replay_of_a_mission(server, tmp_path):
     chart = next(chart for chart in written if chart["title"] == "clearance, m")
     exported = [min(v for v in curve["values"] if v is not None) for curve in chart["curves"]]
     assert exported == pytest.approx(mission.table["clearance"], abs=0.01)
+
+
+def test_replay_of_different_goals(server, tmp_path):
+    """Each run has its own reference, start and goal, at which it arrives; an overview shows all of them."""
+    places = (
+        ((0.0, 0.0, 0.0), (1.5, -0.6, -0.5)),
+        ((0.0, -1.5, 0.0), (2.0, -1.5, 0.0)),
+        ((0.0, 0.0, 0.0), (2.0, 0.3, 0.0)),
+    )
+    tasks = [Task(obstacles=WALLS, start=start, goal=goal) for start, goal in places]
+    drives = [prepared(task, PID)[1].replace(name=f"{k}") for k, task in enumerate(tasks)]
+    save(simulate(drives), tmp_path / "result.zarr")
+    replay = ReplayPage(Library(tmp_path / "result.zarr"), [0, 1, 2], server)
+    replay._scrub(replay.duration)
+    replay.draw()
+    replay.refresh()
+    assert replay._status.content.count("has arrived") == 3
+    marks = replay._scene.navigation._ends
+    drawn = [tuple(np.round(mark.position[:2], 3).tolist()) for mark in marks if mark.visible]
+    expected = [pose[:2] for pair in places for pose in pair]
+    assert sorted(drawn) == sorted(expected)
+    seen = shapely.MultiPoint(replay._scene._seen[:, :2]).convex_hull
+    assert all(seen.covers(shapely.Point(place)) for place in expected)
+    assert {label.anchor for label in replay._scene.robots._labels} == {
+        "bottom-center"
+    }  # above the robot, not beside it
+    replay._show([1])
+    replay.draw()
+    assert [mark.position[1] for mark in replay._scene.navigation._ends if mark.visible] == pytest.approx([-1.5, -1.5])
 
 
 def numbers(page):
@@ -219,7 +249,7 @@ def test_clearance_live(server):
     handle = next(handle for handle in live._plots._handles if handle.title == "clearance, m")
     step = max(1, round(WINDOW / live.session.period) // SAMPLES)
     assert np.array_equal(handle.data[1], clearance[::step].astype(np.float32))
-    assert not live._scene.navigation._ends[0].visible  # a line has no end
+    assert not any(mark.visible for mark in live._scene.navigation._ends)  # a line has no end
 
 
 @pytest.mark.parametrize("localisation", ["scan", "particles"])
@@ -317,7 +347,7 @@ def test_goals_of_a_session(driven):
     assert abs(np.angle(np.exp(1j * away[2]))) < 0.1  # the spline may turn a little at its end
     now = log[-1]
     assert arrived(np.stack([now["x"], now["y"], now["theta"]], -1), now["v"], goal).all()
-    assert arrivals(["PID", "model"], now, ends(first, driven.time)) == ["PID has arrived", "model has arrived"]
+    assert arrivals(["PID", "model"], now, 2 * [ends(first, driven.time)]) == ["PID has arrived", "model has arrived"]
     assert driven.clearance().min() > 0.0 and not driven.failure(0)
 
 
@@ -665,7 +695,7 @@ def test_goal_by_click(tmp_path):
             click(page, (0.9, -0.5), (0.9, -1.2))
             until(lambda: len(live.session.saved()[0].events) == 1, "the plan")
             set_at = live.session.saved()[0].events[0].time
-            until(lambda: place(page, "/world/goal") == pytest.approx([0.9, -0.5], abs=0.03), "the goal in sight")
+            until(lambda: place(page, "/world/goal/0") == pytest.approx([0.9, -0.5], abs=0.03), "the goal in sight")
             page.set_viewport_size({"width": 1280, "height": 800})
             until(
                 lambda: np.abs(edges()).max() == pytest.approx(FILLED_SHARE, abs=1e-3), "a full picture of the new way"
