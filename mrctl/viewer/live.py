@@ -255,6 +255,8 @@ class Live(Page):
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._robot.value = first.robot.path
         self._drawn = self._plotted = None
+        self._sensed.content = block("sensors")  # what the run before has left there
+        self._plots.time.value = self.time
         self._way: Reference | None = None  # that a visitor has brought, as drawn
         self._deviation = 1  # factor on the deviations from the reference in the picture
         self._metrics = Metrics(session.robot, session.period)

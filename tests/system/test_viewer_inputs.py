@@ -381,6 +381,20 @@ def test_looking_back(live):
     assert [e.time for e in live.session.added] == [1.0, 1.2]
 
 
+def test_another_run_begins_empty(live):
+    """A reset leaves neither estimates of the run before nor the time to which a visitor went."""
+    live._restart([Scenario(sensing={"tier": "field"})])
+    for _ in range(100):
+        live.session.step()
+    live.sensors.value = True
+    live.refresh()
+    live._look_back(0.5)
+    assert " mm off" in live._sensed.content and live._plots.time.value == 0.5
+    live._command("reset")
+    live.refresh()
+    assert " mm off" not in live._sensed.content and live._plots.time.value == 0.0
+
+
 def test_order(live):
     """What a visitor does after changing an input comes after it: a reset removes it."""
     live._restart([Scenario()])
