@@ -10,12 +10,11 @@ from typing_extensions import override
 
 from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
-from mrctl.results.metrics import METRICS
 from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
-from mrctl.viewer.scatter import KNOWN_COLUMNS, Scatter, in_words, numbers_of
+from mrctl.viewer.scatter import Scatter, meaning, numbers_of
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE, error
@@ -220,7 +219,6 @@ def _stated(column: str, value: float) -> str:
     """Returns a number of a run in words with its unit as HTML; "" for what is not known or not worth a line."""
     if isinstance(value, bool) or not np.isfinite(value):
         return ""
-    factor, words = in_words(column)
-    text, _, unit = words.partition(", ") if column in METRICS or column in KNOWN_COLUMNS else (words, "", "")
+    factor, text, unit = meaning(column)
     number = f"{value:d}" if isinstance(value, int) else f"{factor * value:.4g}"
     return html.escape(f"{text}: {number} {unit}".rstrip())

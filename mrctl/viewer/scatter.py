@@ -194,8 +194,14 @@ def numbers_of(table: pd.DataFrame) -> list[str]:
     return [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
 
 
-def in_words(column: str) -> tuple[float, str]:
-    """Returns the factor on a column's values, and its name in words with the unit; errors are in mm, as in figures."""
+def meaning(column: str) -> tuple[float, str, str]:
+    """Returns the factor on a column's values, its name in words, and the unit; errors are in mm, as in figures."""
     unit, text = METRICS.get(column, KNOWN_COLUMNS.get(column, ("1", column.replace(".", ", ").replace("_", " "))))
     factor, unit = shown_unit(unit)
+    return factor, text, unit
+
+
+def in_words(column: str) -> tuple[float, str]:
+    """Returns the factor of `meaning`, and the name with the unit."""
+    factor, text, unit = meaning(column)
     return factor, f"{text}, {unit}" if unit else text
