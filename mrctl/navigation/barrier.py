@@ -94,7 +94,7 @@ def half_planes(request: Array, pose: Array, outlines: Outlines, barrier: Barrie
                 centre = np.hypot(dx, dy)
                 away, nx, ny = centre - ring[2], dx / max(centre, 1e-9), dy / max(centre, 1e-9)
             else:
-                away, nx, ny = from_polygon(x, y, edges[first[p] : first[p + 1]])
+                away, nx, ny = away_from(x, y, edges[first[p] : first[p + 1]])
             # ḣ = n · ṗ of the disc's centre p, with ṗ = V (cos θ, sin θ) + θ̇ (−(p − P)_y, (p − P)_x).
             rows[n, 0] = nx * cos + ny * sin
             rows[n, 1] = (ny * (x - pose[0]) - nx * (y - pose[1])) / barrier.lever
@@ -111,7 +111,7 @@ def approach(h: float, deceleration: float, period: float) -> float:
 
 
 @kernel
-def from_polygon(x: float, y: float, sides: Array) -> tuple[float, float, float]:
+def away_from(x: float, y: float, sides: Array) -> tuple[float, float, float]:
     """Returns the distance of a point from a convex polygon in m, negative inside, and the unit vector away from it.
 
     Args:

@@ -79,7 +79,7 @@ class Chart:
         if (ring := shape - len(discs)) < 0:
             return np.hypot(*(points - discs[shape, :2]).T) - discs[shape, 2]
         found = np.empty(len(points))
-        from_polygon.compiled(np.ascontiguousarray(points), edges[first[ring] : first[ring + 1]], found)
+        distances_from.compiled(np.ascontiguousarray(points), edges[first[ring] : first[ring + 1]], found)
         return found
 
     def _inside(self, shape: int) -> tuple[Array, float]:
@@ -121,7 +121,7 @@ class Chart:
 
 
 @kernel
-def from_polygon(points: Array, sides: Array, found: Array) -> None:
+def distances_from(points: Array, sides: Array, found: Array) -> None:
     """Writes the distances of points, `(k, 2)`, from a polygon with sides `(n, 4)` in m, negative inside, `(k,)`."""
     for k in range(len(points)):
         found[k] = point_to_polygon(points[k, 0], points[k, 1], sides)
