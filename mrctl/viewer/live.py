@@ -583,6 +583,8 @@ class Live(Page):
     def _status_lines(self) -> list[str]:
         """Returns what the page says of the session: time, lap and pace, who has stopped and why, and who arrived."""
         doing = "playing" if self.playing else "paused" if self.session.running else "finished; reset starts again"
+        if self.playing and not self.session.tick:
+            doing = "starting; laws that are new are compiled"
         if self._back is not None:
             doing = f"of {self.session.time:.2f} s; whatever you do goes on from here"
         lap = "" if self._ends is not None else f" · lap {self._lap()}"

@@ -391,6 +391,13 @@ def test_another_run_begins_empty(live):
     live._look_back(0.5)
     assert " mm off" in live._sensed.content and live._plots.time.value == 0.5
     live._command("reset")
+    live._command("play")
+    live.refresh()
+    assert "compiled" in live._status.content  # which the first tick may take seconds for
+    live.session.step()
+    live.refresh()
+    assert "compiled" not in live._status.content and "playing" in live._status.content
+    live._command("reset")
     live.refresh()
     assert " mm off" not in live._sensed.content and live._plots.time.value == 0.0
 
