@@ -255,7 +255,7 @@ class Live(Page):
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._robot.value = first.robot.path
         self._drawn = self._plotted = None
-        self._sensed.content = block("sensors")  # what the run before has left there
+        self.describe_estimates([], session.log(0, 0))  # in place of those of the run before
         self._plots.time.value = self.time
         self._way: Reference | None = None  # that a visitor has brought, as drawn
         self._deviation = 1  # factor on the deviations from the reference in the picture

@@ -826,7 +826,7 @@ def test_export(browser, tmp_path):
         first = node(page, ROBOT, scene)
         until(lambda: np.linalg.norm(node(page, ROBOT, scene) - first) > 0.2, "it to play by itself")
         chart = page.locator("canvas").first.bounding_box()
-        page.mouse.click(chart["x"] + 52 + (chart["width"] - 60) / 2, chart["y"] + 60)
+        page.mouse.click(chart["x"] + 52 + (chart["width"] - 70) / 2, chart["y"] + 60)
         until(lambda: page.inner_text("#time").startswith(("2.9", "3.0")), "the scrubber to follow the curves")
         half = until(lambda: (p := node(page, ROBOT, scene)) is not None and p[1] > 1.4 and p, "the robot to follow")
         assert np.allclose(half[:2], [0, 1.6], atol=0.1)  # half way around

@@ -1,7 +1,6 @@
 """Hybrid A*: plans are free and can be driven, and cost no more than an exhaustive search of the same lattice finds."""
 
 from itertools import pairwise
-from time import thread_time
 
 import numpy as np
 import pytest
@@ -96,30 +95,26 @@ def test_field(reverse):
             assert np.array_equal(a.poses, b.poses) and a.cost == b.cost and a.expanded == b.expanded
 
 
-def seconds(work, *arguments):
-    """Returns what a function returns, and the time that it takes this thread in s."""
-    begun = thread_time()
-    return work(*arguments), thread_time() - begun
-
-
-def test_long_plan():
-    """On a map with many obstacles the shortcuts of a long plan take no more than some times as long as the search."""
-    cells = np.zeros((240, 240), bool)  # of 10 cm
+def test_long_plan(monkeypatch):
+    """Paths that are left out, because the way around the obstacles is longer, would have led nowhere."""
+    cells = np.zeros((120, 120), bool)  # of 10 cm
     cells[:2] = cells[-2:] = cells[:, :2] = cells[:, -2:] = True
-    for k in range(1, 6):  # rooms with doors at their ends in turn
+    for k in (1, 2):  # rooms with doors at their ends in turn
         cells[:, 40 * k : 40 * k + 2] = True
-        cells[slice(3, 15) if k % 2 else slice(225, 237), 40 * k : 40 * k + 2] = False
+        cells[slice(3, 15) if k % 2 else slice(105, 117), 40 * k : 40 * k + 2] = False
     near = np.zeros_like(cells)
     for rows, columns in np.ndindex(3, 3):
         near |= np.roll(cells, (rows - 1, columns - 1), (0, 1))
     cells |= near & (np.random.default_rng(0).random(cells.shape) < 0.35)  # rough walls, of many rectangles
     outlines = Surroundings(Map(100 * cells.astype(np.int8), 0.1, np.zeros(3)).obstacles()).at(0.0)
-    start, goal, low, high = np.array([2.0, 12.0, 1.5]), np.array([22.0, 12.0, 1.5]), np.zeros(2), np.full(2, 24.0)
-    for _ in range(2):  # which compiles the functions
-        where = space(outlines, FOOTPRINT, low, high)
-        found, searches = seconds(plan, where, start, goal, RADIUS, False)
-        shorter, shortens = seconds(shortcut, where, found, RADIUS, False)
-    assert len(outlines.rings) > 500 and shorter.length > 100 and shortens < 15 * searches
+    start, goal, low, high = np.array([2.0, 8.0, 1.5]), np.array([10.0, 6.0, 1.5]), np.zeros(2), np.full(2, 12.0)
+    where = space(outlines, FOOTPRINT, low, high)
+    found = plan(where, start, goal, RADIUS, False)
+    shorter = shortcut(where, found, RADIUS, False)
+    monkeypatch.setattr(hybrid_astar, "cost_to_go", lambda where, goal: np.zeros(where.field.distance.shape))
+    every = shortcut(where, found, RADIUS, False)  # with all paths tried
+    assert len(outlines.rings) > 200 and 20 < shorter.length < found.length
+    assert np.array_equal(shorter.poses, every.poses) and shorter.cost == every.cost
 
 
 def test_parking():
