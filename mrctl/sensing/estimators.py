@@ -86,13 +86,13 @@ def reckon(tick: int, ring: Rows, i: int, geometry: Row, period: float, m: Array
     The heading in the middle of the period is the direction of Δs.
 
     Args:
-        tick: As for `truth`, and so are the others.
-        ring: Samples and commands.
+        tick: Control tick.
+        ring: Samples and commands, as in `Sensors`, `(N, B)`.
         i: Index of the robot.
         geometry: A record of `GEOMETRY`.
         period: Control period in s.
-        m: In and out: `mean` of `SAMPLED_MOTION`.
-        s: In and out: record of `SEEN`, whose `estimate` is the result.
+        m: In and out: x, y, θ, V and θ̇ when the samples were taken, in m, m, rad, m/s and rad/s, `(5,)`.
+        s: In and out: a record of `SEEN`, whose `estimate` is the result.
     """
     now = tick - s.age
     if now > s.start:
