@@ -29,7 +29,7 @@ from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import reached
 from mrctl.navigation.plan import Plan
-from mrctl.navigation.planning import PATIENCE, REPLAN_MARGIN, planned
+from mrctl.navigation.planning import PATIENCE, REPLAN_MARGIN, Query, planned
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
@@ -107,7 +107,7 @@ def draw(vehicle: Vehicle, width: float, speed: float, seed: int) -> Draw | None
     """Makes a corridor and plans a way through it; None where there is no way."""
     task = corridor(width, seed, **SHAPE)
     with suppress(InputError):
-        return Draw(seed, *planned(task, vehicle, speed, REPLAN_MARGIN), task.goal)
+        return Draw(seed, *planned(Query(task, vehicle, speed, REPLAN_MARGIN)), task.goal)
 
 
 def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float, threads: int) -> dict[str, list[Run]]:

@@ -29,7 +29,7 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import corridor, corridor_width
-from mrctl.navigation.planning import PATIENCE, planned
+from mrctl.navigation.planning import PATIENCE, Query, planned
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority
@@ -180,7 +180,7 @@ def draw(vehicle: Vehicle, seed: int, width: float, speeds: Sequence[float]) -> 
     task, rest = corridor(width, seed, **SHAPE), width * (1 - 1 / ROOMY_FACTOR)
     for share in PLAN_MARGINS:
         try:
-            found, fastest = planned(task, vehicle, speeds[-1], share * rest / 2)
+            found, fastest = planned(Query(task, vehicle, speeds[-1], share * rest / 2))
         except InputError:
             continue
         return Draw(seed, [*(found.reference(speed, limits) for speed in speeds[:-1]), fastest], task.goal)

@@ -13,7 +13,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.hybrid_astar import NoWay
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.planning import REACTIVE, REPLAN_MARGIN, Avoid, planned
+from mrctl.navigation.planning import REACTIVE, REPLAN_MARGIN, Avoid, Query, planned
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.navigation.window import Window
@@ -46,10 +46,8 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         start = Task.from_dict({"obstacles": scenario.known, "start": here, "goal": goal})
         keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
         try:
-            return planned(
-                start, vehicle, plan.speed, REPLAN_MARGIN,
-                outlines=outlines, reverse=keeps and vehicle.reverses, twist=now, keeps=keeps, beyond=True,
-            )[1]  # fmt: skip
+            query = Query(start, vehicle, plan.speed, REPLAN_MARGIN, outlines, now, keeps)
+            return planned(query, reverse=keeps and vehicle.reverses, beyond=True)[1]
         except NoWay:
             raise
         except InputError:  # it waits, and tries again

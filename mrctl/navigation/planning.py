@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,39 @@ REACTIVE = "window", "mppi"
 """Motion stages that go along a plan at their own pace; their plans never reverse."""
 
 
+class Query(NamedTuple):
+    """A robot that asks for a way from a start to a goal."""
+
+    task: Task
+    """World, start and goal."""
+    vehicle: Vehicle
+    """The robot."""
+    speed: float | None = None
+    """Largest speed in m/s; by default 0.9 of the robot's."""
+    margin: float = PLAN_MARGIN
+    """Clearance that the plan keeps in m."""
+    outlines: Outlines | None = None
+    """The obstacles; by default those on the map."""
+    twist: tuple[float, float] = (0.0, 0.0)
+    """V in m/s and θ̇ in rad/s at the start."""
+    keeps: bool = True
+    """Whether the robot keeps the plan in time, and does not go along it at its own pace."""
+
+    def check(self) -> None:
+        """Refuses a margin or a speed that is out of range, and a robot that is at its goal.
+
+        Raises:
+            InputError: The message says which.
+        """
+        if arrived(np.array(self.task.start), 0.0, np.array(self.task.goal)):
+            raise InputError("goal: the robot starts there")
+        if not 0 <= self.margin <= 10:
+            raise InputError(f"margin: must be between 0 and 10 m, not {self.margin:g}")
+        fastest = self.vehicle.robot.max_speed
+        if self.speed is not None and not MIN_SPEED <= self.speed <= fastest:
+            raise InputError(f"speed: must be between {MIN_SPEED:g} and {fastest:g} m/s, not {self.speed:g}")
+
+
 def prepared(
     task: Task,
     scenario: Scenario,
@@ -63,16 +96,13 @@ def prepared(
         InputError: As `planned`; or forward there is no way, and `avoid` never plans in reverse.
     """
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
-    backwards = vehicle.reverses and not reactive
+    query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
     try:
-        found, reference = planned(
-            task, vehicle, speed, margin, reverse=backwards, twist=twist, keeps=not reactive, beyond=True
-        )
+        found, reference = planned(query, reverse=vehicle.reverses and not reactive, beyond=True)
     except NoWay:
         if not (reactive and vehicle.reverses):
             raise
-        at_rest = partial(_planned, task, vehicle, speed, margin, None, (0.0, 0.0), True)
-        _or_beyond(partial(at_rest, True))  # raises, too, if there is none
+        _or_beyond(partial(_planned, query._replace(twist=(0.0, 0.0)), True))  # raises, too, if there is none
         raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING_PATIENCE
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
@@ -86,18 +116,7 @@ def prepared(
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
-def planned(
-    task: Task,
-    vehicle: Vehicle,
-    speed: float | None,
-    margin: float,
-    *,
-    outlines: Outlines | None = None,
-    reverse: bool = False,
-    twist: tuple[float, float] = (0.0, 0.0),
-    keeps: bool = True,
-    beyond: bool = False,
-) -> tuple[Plan, Waypoints]:
+def planned(query: Query, *, reverse: bool = False, beyond: bool = False) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference.
 
     The plan reverses only if it may, and where there is none forward that the robot can drive. It stays in the box
@@ -112,14 +131,8 @@ def planned(
     A plan for a robot that stands or reverses begins at rest.
 
     Args:
-        task: World, start and goal.
-        vehicle: The robot.
-        speed: Largest speed in m/s; by default 0.9 of the robot's.
-        margin: Clearance that the plan keeps in m.
-        outlines: The obstacles; by default those on the map.
+        query: Robot, start and goal, and what the plan keeps.
         reverse: Whether the plan may reverse.
-        twist: V in m/s and θ̇ in rad/s at the start.
-        keeps: Whether the robot keeps the plan in time, and does not go along it at its own pace.
         beyond: Whether the plan may go beyond the box around the map.
 
     Raises:
@@ -127,24 +140,16 @@ def planned(
         InputError: The margin or the speed is out of range, start or goal is within the margin of an obstacle or off
             the map, the robot is at its goal, or it cannot drive the plan, or would touch an obstacle on it.
     """
-    if arrived(np.array(task.start), 0.0, np.array(task.goal)):
-        raise InputError("goal: the robot starts there")
-    if not 0 <= margin <= 10:
-        raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
-    fastest = vehicle.robot.max_speed
-    if speed is not None and not MIN_SPEED <= speed <= fastest:
-        raise InputError(f"speed: must be between {MIN_SPEED:g} and {fastest:g} m/s, not {speed:g}")
-
-    search = partial(_planned, task, vehicle, speed, margin, outlines, twist, keeps)
+    query.check()
 
     def either_way(around: bool) -> tuple[Plan, Waypoints]:
         try:
-            return search(False, around)
+            return _planned(query, False, around)
         except InputError as fault:  # there is no way, or none that the robot can drive
             if not reverse:
                 raise
             try:
-                return search(True, around)
+                return _planned(query, True, around)
             except NoWay:
                 if isinstance(fault, NoWay):
                     raise
@@ -168,27 +173,11 @@ def _or_beyond(search: Callable[[bool], tuple[Plan, Waypoints]]) -> tuple[Plan, 
         raise
 
 
-def _planned(
-    task: Task,
-    vehicle: Vehicle,
-    speed: float | None,
-    margin: float,
-    outlines: Outlines | None,
-    twist: tuple[float, float],
-    keeps: bool,
-    reverse: bool,
-    around: bool,
-) -> tuple[Plan, Waypoints]:
+def _planned(query: Query, reverse: bool, around: bool) -> tuple[Plan, Waypoints]:
     """Returns a plan that only drives forward, or one that reverses wherever that is cheaper, and its reference.
 
     Args:
-        task: World, start and goal.
-        vehicle: The robot.
-        speed: Largest speed in m/s; by default 0.9 of the robot's.
-        margin: Clearance that the plan keeps in m.
-        outlines: The obstacles; by default those on the map.
-        twist: V in m/s and θ̇ in rad/s at the start.
-        keeps: Whether the robot keeps the plan in time.
+        query: What is asked for.
         reverse: Whether the plan may reverse.
         around: Whether the plan may go around what stands at the border of the box around the map.
 
@@ -197,6 +186,7 @@ def _planned(
         InputError: Start or goal is within the margin of an obstacle, or the robot cannot drive the plan, or would
             touch an obstacle on it.
     """
+    task, vehicle, speed, margin, outlines, twist, keeps = query
     known, (corners, robot, _) = task.known, vehicle
     speed = LIMIT_SHARE * robot.max_speed if speed is None else speed
     outlines = Surroundings(known).at(0.0) if outlines is None else outlines

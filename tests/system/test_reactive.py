@@ -11,7 +11,7 @@ from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import navigate
 from mrctl.navigation.mppi import Mppi
-from mrctl.navigation.planning import Avoid, planned, prepared
+from mrctl.navigation.planning import Avoid, Query, planned, prepared
 from mrctl.navigation.replanning import Planner
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
 from mrctl.navigation.vehicle import Vehicle
@@ -360,7 +360,7 @@ def test_goal_before_a_wall(robot: str, avoid: Avoid) -> None:
 def test_limits() -> None:
     """What the stages ask for is within the bounds at every tick, also where the robot is thrown about."""
     task = Task(obstacles=Obstacles(shapes=(crossing(0.4),)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
-    plan = planned(task, Vehicle.of(PLANNED), None, 0.05)[1]
+    plan = planned(Query(task, Vehicle.of(PLANNED)))[1]
     own = PLANNED.replace(obstacles=task.obstacles, reference=plan, goal=task.goal)
     robot, random = Vehicle.of(own).robot, np.random.default_rng(1)
     for avoid in ("window", "mppi"):

@@ -15,7 +15,7 @@ from mrctl.navigation.generators import Task, cellular, corridor, parking_bay
 from mrctl.navigation.hybrid_astar import NoWay, cost_to_go, plan, shortcut, space
 from mrctl.navigation.maps import Map
 from mrctl.navigation.plan import least_clearance, run_out
-from mrctl.navigation.planning import planned
+from mrctl.navigation.planning import Query, planned
 from mrctl.navigation.steer import sample, steer
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.clearance import clearance
@@ -362,7 +362,7 @@ TWISTS = [(0.7, 0.0), (0.7, 0.8), (1.2, -0.5)]
 def test_begins_as_the_robot_drives(twist, goal):
     """A plan for a robot that drives begins with its pose, θ̇ / V and about its V, wherever it leads."""
     task = Task(obstacles=Obstacles(shapes=(Disc(x=0.0, y=-6.0),)), start=(0.2, 0.1, 0.3), goal=goal)
-    found, course = planned(task, CAR, None, 0.05, twist=twist)
+    found, course = planned(Query(task, CAR, twist=twist))
     motion = course.sample(np.zeros(1))
     v, omega = motion.twist[0]
     assert np.allclose(motion.pose[0], task.start, atol=6e-3)
@@ -378,14 +378,14 @@ def test_begins_where_it_can():
     """Before a wall a plan begins at the robot, as slowly as it must; one that stands or reverses gets it from rest."""
     wall = Box(x=0.9, y=0.0, length=0.2, width=1.0)
     task = Task(obstacles=Obstacles(shapes=(wall,)), start=(0, 0, 0), goal=(0.2, 2.2, 3.1))
-    still = planned(task, CAR, None, 0.02)
+    still = planned(Query(task, CAR, margin=0.02))
     for twist in ((0.0, 0.0), (0.04, 0.3), (-0.5, 0.0)):
-        assert planned(task, CAR, None, 0.02, twist=twist)[1] == still[1]
-    found, course = planned(task, CAR, None, 0.02, twist=(0.9, 0.4))
+        assert planned(Query(task, CAR, margin=0.02, twist=twist))[1] == still[1]
+    found, course = planned(Query(task, CAR, margin=0.02, twist=(0.9, 0.4)))
     assert np.array_equal(found.poses, still[0].poses) and course.start_curvature == 0
     assert 0 < course.sample(np.zeros(1)).twist[0, 0] < 0.6 and course.period < still[1].period
     free = task.replace(obstacles=Obstacles(shapes=(Box(x=0.0, y=3.0, length=0.2, width=0.2),)), goal=(-2, 0, 0))
-    back = planned(free, Vehicle.of(Scenario(steering="rigid")), None, 0.02, reverse=True, twist=(0.5, 0.0))[1]
+    back = planned(Query(free, Vehicle.of(Scenario(steering="rigid")), margin=0.02, twist=(0.5, 0.0)), reverse=True)[1]
     v = back.sample(np.linspace(0, back.period, 2000)).twist[:, 0]
     assert v[0] == pytest.approx(0.5, rel=0.1)
 
@@ -415,14 +415,14 @@ def test_around_the_border(robot: str, width: float):
     """A wall in the open, of any width, is gone around, hardly longer than along a string; a map may end at its box."""
     vehicle, wall = Vehicle.of(Scenario(robot=robot)), Box(x=2.0, length=0.1, width=width)
     task = Task(obstacles=Obstacles(shapes=(wall,)), start=(0, 0, 0), goal=(4, 0, 0))
-    found, course = planned(task, vehicle, None, 0.05, beyond=True)
+    found, course = planned(Query(task, vehicle), beyond=True)
     half = width / 2 + vehicle.width / 2 + 0.05  # of the middle of a robot that drives past the end of the wall
     string = 2 * np.hypot(1.95, half) + 0.1
     assert string < found.length < 1.05 * string
     assert least_clearance(vehicle.footprint, course, Surroundings(task.obstacles).at(0.0)) > 0.02
     if width > 2:
         with pytest.raises(NoWay):
-            planned(task, vehicle, None, 0.05)
+            planned(Query(task, vehicle))
 
 
 def test_closed_room(monkeypatch):
@@ -434,7 +434,7 @@ def test_closed_room(monkeypatch):
         searches.clear()
         task = Task(obstacles=Obstacles(shapes=tuple(walls)), start=start, goal=goal)
         with pytest.raises(NoWay, match=rf"^goal: there is no way to \({goal[0]:.2f}, 0.00\)$"):
-            planned(task, CAR, None, 0.05, beyond=True)
+            planned(Query(task, CAR), beyond=True)
         assert len(searches) == (2 if goal[0] > 2 else 1)  # the second one ends as it begins
 
 
@@ -446,7 +446,7 @@ def test_enclosed_start(monkeypatch):
     monkeypatch.setattr(planning, "plan", lambda *arguments: searches.append(arguments) or plan(*arguments))
     task = Task(obstacles=Obstacles(shapes=(*walls, post)), start=(-1, 0, 0), goal=(4, 0, 0))
     with pytest.raises(NoWay) as refusal:
-        planned(task, CAR, None, 0.2, beyond=True)
+        planned(Query(task, CAR, margin=0.2), beyond=True)
     where = searches[0][0]
     assert len(searches) == 1 and not refusal.value.at_border
     row, column = ((np.array([0.0, -1.0]) - where.field.origin[::-1]) / where.field.resolution).astype(int)
@@ -464,13 +464,13 @@ def test_enclosed_start(monkeypatch):
 def test_refusal_of_both_searches(forward, reverse, shown, monkeypatch):
     """Where neither way is driven, the message is that of the one that comes nearer: a way that cannot be driven."""
 
-    def refused(*arguments):
-        raise reverse if arguments[7] else forward
+    def refused(query, backwards, around):
+        raise reverse if backwards else forward
 
     monkeypatch.setattr(planning, "_planned", refused)
     task = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(2, 0, 0))
     with pytest.raises(InputError, match=shown) as refusal:
-        planned(task, CAR, None, 0.05, reverse=True)
+        planned(Query(task, CAR), reverse=True)
     assert isinstance(refusal.value, NoWay) == (isinstance(forward, NoWay) and isinstance(reverse, NoWay))
 
 

@@ -14,7 +14,7 @@ from toppra.constraint import DiscretizationType, LinearConstraint
 from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
 import mrctl
-from mrctl.navigation.planning import planned
+from mrctl.navigation.planning import Query, planned
 from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
@@ -269,7 +269,7 @@ def test_plans_of_missions(kinds, seeds):
         scenario, shares, longer = mrctl.Scenario.from_dict({"robot": {"path": name}}), [], []
         for kind, seed in product(kinds, range(1, seeds + 1)):
             try:
-                reference = planned(task_of(f"{kind}:{seed}", scenario), Vehicle.of(scenario), None, 0.05)[1]
+                reference = planned(Query(task_of(f"{kind}:{seed}", scenario), Vehicle.of(scenario)))[1]
             except InputError as error:  # worlds without a way
                 print(name, kind, seed, error)
                 continue
