@@ -396,11 +396,13 @@ class Session:
 
 
 def pushed(scenario: Scenario, time: float) -> Array | None:
-    """Returns the force of a push along the world's x and y in N, `(2,)`, that acts or is half a second old at most."""
-    for event in scenario.events:
-        if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, MIN_PUSH_TIME):
-            return np.array(event.push[:2])
-    return None
+    """Returns the sum of the pushes that act, or are half a second old at most, along x and y in N, `(2,)`, or None."""
+    forces = [
+        event.push[:2]
+        for event in scenario.events
+        if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, MIN_PUSH_TIME)
+    ]
+    return np.sum(forces, axis=0) if forces else None
 
 
 def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:
