@@ -83,6 +83,8 @@ EKF = np.dtype(
         ("fix_variance", "f8", 3),  # m², m², rad²
         ("inertial", "f8"),  # V from accelerometer and the wheels that grip, m/s
         ("offset", "f8"),  # offset o of the accelerometer as the observer of `find_grip` estimates it, m/s²
+        ("since", "f8", 3),  # number of ticks since the last encoder sample, sums of V in m/s and θ̇ in rad/s over them
+        ("grip", "u1", 2),  # whether the wheels gripped at the last encoder sample, left and right
         ("difference", "f8"),  # mean of left less right wheel's speed by its encoder, less that by the gyro, m/s
         ("drift", "f8", 2),  # running means for `find_drift`: of the position along the heading, and of the heading
         ("drift_bound", "f8"),  # on these means; infinite where the fixes are not independent of encoders and gyro
@@ -348,7 +350,8 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     It has the bandwidth ω₀ = `OBSERVER_BANDWIDTH`, and its offset o is faster than that of the filter. A wheel slips if
     its own difference is larger than `SLIPPING_SPEED` plus one count, or if it is the larger one and the two together
     contradict the gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by
-    three times `HELD_NOISE` then.
+    three times `HELD_NOISE` then. Between two samples of slow encoders e is unknown, and what was decided last holds.
+    The rate of an encoder that counts is a mean since its last sample; V and ω are then means over the same ticks.
 
     Args:
         now: In and out: a record of `SAMPLE`, whose `grip` and `doubt` are the result.
@@ -357,30 +360,39 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
         sensor: A record of `SENSOR`.
         s: In and out: a record of `EKF`.
     """
-    r, D = geometry.wheel_radius, geometry.half_track
+    r, D, P, gap = geometry.wheel_radius, geometry.half_track, s.P, period * sensor.encoder_every
     omega = now.gyro - s.mean[BIAS]
     ahead = s.inertial + period * (now.acceleration[0] + geometry.imu_x * omega * omega - s.offset)
+    if sensor.quantum == 0:
+        s.since[:] = 0.0
+    s.since[0] += 1
+    s.since[1] += ahead
+    s.since[2] += omega
+    if not now.encoder_new:
+        now.grip[0], now.grip[1], s.inertial = s.grip[0], s.grip[1], ahead
+        return
+    v, omega = s.since[1] / s.since[0], s.since[2] / s.since[0]
+    s.since[:] = 0.0
     waits, turn = period * (sensor.accelerometer_every - 1), HELD_NOISE[1] * period * (sensor.gyro_every - 1)
-    bound = (
-        SLIPPING_SPEED + r * sensor.quantum / (period * sensor.encoder_every) + 3 * (HELD_NOISE[0] * waits + D * turn)
-    )
-    left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
-    right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
+    bound = SLIPPING_SPEED + r * sensor.quantum / gap + 3 * (HELD_NOISE[0] * waits + D * turn)
+    left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (v - D * omega)
+    right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (v + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound
     if now.grip[0] + now.grip[1] == 2:
-        find_radius(left - right, now, geometry, period, s)
-    P = s.P
-    spread = 4 * (r / (period * sensor.encoder_every)) ** 2 * s.encoder_variance
+        find_radius(left - right, now, geometry, gap, s)
+    spread = 4 * (r / gap) ** 2 * s.encoder_variance
     spread += 4 * D * D * (s.gyro_variance + turn * turn + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
     if abs(left - right) > 4 * np.sqrt(spread) + GRIP_DIFFERENCE:  # by the gyro, one of them slips
         wheel = 0 if abs(left) > abs(right) else 1
         now.grip[wheel] = 0
+    s.grip[0], s.grip[1] = now.grip[0], now.grip[1]
     count = now.grip[0] + now.grip[1]
     if count > 0:
         mean = (now.grip[0] * left + now.grip[1] * right) / count
-        ahead += 2 * OBSERVER_BANDWIDTH * period * mean
-        s.offset -= OBSERVER_BANDWIDTH**2 * period * mean
+        bandwidth = min(OBSERVER_BANDWIDTH, 0.5 / gap)  # V is corrected by e at most
+        ahead += 2 * bandwidth * gap * mean
+        s.offset -= bandwidth**2 * gap * mean
     s.inertial = ahead
 
 

@@ -338,7 +338,7 @@ class Estimator:
         own = sensing.localisation == "particles"  # moved by encoders and gyro, so that errors of fixes last
         memory["drift_bound"] = np.inf if own else DRIFT_SIGMAS / np.sqrt(2 * INNOVATION_FIXES - 1)
         memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
-        memory["inertial"] = memory["mean"][3]
+        memory["inertial"], memory["grip"] = memory["mean"][3], 1
 
     def measure(self, tick: int, plant: Rows, derivative: Array) -> None:
         """Samples the sensors and estimates, and writes the result to `seen`.

@@ -384,6 +384,30 @@ def test_late_fix():
             assert not np.allclose(memory["P"][0], memory["P"][1], rtol=0.01)
 
 
+class Hurry(Drive):
+    """A robot that accelerates and brakes hard."""
+
+    def twist(self, t):
+        return 0.6 + 0.5 * np.sin(3 * t), np.sin(0.7 * t), 1.5 * np.cos(3 * t), 0.7 * np.cos(0.7 * t)
+
+
+@pytest.mark.parametrize("counts", [0, 4000])
+@pytest.mark.parametrize("rate", [50, 10, 5, 2])
+def test_slow_encoders(rate, counts):
+    """Wheels that grip are found to grip, and V stays within its deviation, however seldom the encoders are read.
+
+    A rate that is as old as the last sample, or the mean since the one before, differs from V of now by up to V̇/rate.
+    """
+    drive, errors, slipped = Hurry([lab(encoder_rate=rate, encoder_counts=counts)]), [], 0
+    for tick in range(600):
+        drive.step()
+        slipped += (drive.sensors.ring[tick % len(drive.sensors.ring), 0]["grip"] != 1).any()
+        memory = drive.filters.memory[0]
+        errors.append((memory["mean"][V] - drive.plant["reading"]["twist"][0, 0]) / np.sqrt(memory["P"][V, V]))
+    assert slipped == 0
+    assert np.sqrt(np.mean(np.square(errors))) < 2
+
+
 def test_several_fixes_on_their_way():
     """So do fixes that are older than the time between two of them, of which four are on their way."""
     drive = Drive([lab(fix_rate=20, fix_latency=0.2), lab(fix_rate=20, fix_latency=0.0)])
