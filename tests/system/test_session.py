@@ -14,7 +14,7 @@ from mrctl.results.excitation import alone, parameter_error
 from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.looks import Look
 from mrctl.viewer.score import lessons, whole_laps
-from mrctl.viewer.session import Session, changed
+from mrctl.viewer.session import Session, changed, pushed
 
 BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
 
@@ -185,3 +185,18 @@ def test_what_is_learned():
     for table, k in ((common, 0), (difference, 1)):
         assert table["A & B"].astype(float).values == pytest.approx(expected[:, k], rel=0.06)
         assert (table["fel"] == "–").all()
+
+
+def test_arrow_of_overlapping_pushes():
+    """The arrow shows the force that the plant applies: the sum of the pushes that act."""
+    pushes = [
+        Event(time=0.5, push=(10.0, 0.0, 0.0), push_duration=2.0),
+        Event(time=1.0, push=(0.0, 5.0, 1.0), push_duration=1.0),
+    ]
+    scenario = BASE.replace(events=tuple(pushes))
+    session = Session([scenario])
+    drive(session, 130)
+    ((_, sim),) = session.simulations
+    assert np.array_equal(pushed(scenario, session.time), [10.0, 5.0])
+    assert np.array_equal(sim.plant.wrench[0].sum(axis=0)[:2], [10.0, 5.0])
+    assert pushed(scenario, 0.4) is None and np.array_equal(pushed(scenario, 2.4), [10.0, 0.0])
