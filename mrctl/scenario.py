@@ -213,6 +213,11 @@ class Scenario(Record):
         return self.obstacles.still if self.map is None else self.map
 
     @property
+    def schedule(self) -> list[Event]:
+        """The events in the order of their times; those of one time stay in the order in which they are given."""
+        return sorted(self.events, key=lambda event: event.time)
+
+    @property
     def feedforward(self) -> str:
         """Name of prior and learner in tables."""
         return feedforward_name(self.prior, self.learner)

@@ -28,7 +28,7 @@ def course(scenario: Scenario, ticks: range) -> Rows:
     """Returns the reference of a scenario, including the events that change it, one record of `GOAL` for each tick."""
     period = scenario.control_period
     samples = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
-    for event in sorted(scenario.events, key=lambda e: e.time):
+    for event in scenario.schedule:
         start = event.tick(period)
         if event.reference is not None and (since := max(start, ticks.start)) < ticks.stop:
             times = period * np.arange(since - start, ticks.stop - start, dtype=float)

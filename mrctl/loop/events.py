@@ -37,7 +37,7 @@ class Events:
             self._enter(row, scenario, 0)
 
     def _enter(self, row: int, scenario: Scenario, tick: int) -> None:
-        for event in sorted(scenario.events, key=lambda e: e.time):
+        for event in scenario.schedule:
             self._schedule[tick + event.tick(self._period)].append((row, event))
             if event.reference is not None:
                 since = max(tick, tick + event.tick(self._period) - self._preview)

@@ -17,7 +17,7 @@ CHANGEABLE = ["perturbation", "kanayama", "pid"]
 def state(scenario: Scenario, time: float) -> dict[str, Any]:
     """Returns the values of the fields `CHANGEABLE`, and of `learning`, at a time in s of a run."""
     now: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
-    for event in sorted(scenario.events, key=lambda e: e.time):
+    for event in scenario.schedule:
         if event.time <= time + 1e-9:
             now |= {name: value for name in now if (value := getattr(event, name)) is not None}
     return now
@@ -25,7 +25,7 @@ def state(scenario: Scenario, time: float) -> dict[str, Any]:
 
 def followed(scenario: Scenario, time: float) -> Reference:
     """Returns the reference that a run follows at a time in s."""
-    brought = [e.reference for e in sorted(scenario.events, key=lambda e: e.time) if e.time <= time + 1e-9]
+    brought = [e.reference for e in scenario.schedule if e.time <= time + 1e-9]
     return next((reference for reference in reversed(brought) if reference), scenario.reference)
 
 

@@ -637,7 +637,7 @@ class Live(Page):
         scenario = self.session.fullest
         before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
         lines = []
-        for event in sorted(scenario.events, key=lambda e: e.time):
+        for event in scenario.schedule:
             lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         self._timeline.content = block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"]))
