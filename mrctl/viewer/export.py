@@ -15,7 +15,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
-from mrctl.viewer.plots import charts, legend
+from mrctl.viewer.plots import Chart, charts, legend, references_differ
 from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
@@ -57,21 +57,21 @@ def page(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
         recordings: Runs in one world; the first one is solid, the others are ghosts.
         robots: Look of each run.
     """
+    times, log, clearance = joint_log(recordings)
+    apart = references_differ(log)
     parts = {
-        "legend": legend(robots),
-        "scene": html.escape(_scene(recordings, robots)),
-        "data": _curves(recordings, robots),
+        "legend": legend(robots, apart),
+        "scene": html.escape(_scene(recordings, robots, magnification(extent(log)))),
+        "data": _curves(times, charts(log, robots, recordings[0].period, clearance, apart), event_times(recordings)),
     }
     return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], PLAYER.read_text())
 
 
-def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
-    """Returns the scene with its player, as a complete page in HTML."""
+def _scene(recordings: Sequence[Recording], robots: Sequence[Look], magnified: int) -> str:
+    """Returns the scene with its player, as a complete page in HTML; deviations are magnified by a factor."""
     server = Server(port=0)
     try:
         scene = Scene(server, recordings[0].model, robots, recordings[0].scenario.obstacles)
-        _, log, _ = joint_log(recordings)
-        magnified = magnification(extent(log))
         scene.show_recordings(recordings, magnified)
         duration = max(r.duration for r in recordings)
         serializer = server.get_scene_serializer()
@@ -84,12 +84,11 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
         server.stop()
 
 
-def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
-    """Returns the curves as JSON that is safe inside a script element."""
-    times, log, clearance = joint_log(recordings)
-    step = max(1, len(log) // SAMPLES)
+def _curves(times: Array, found: Sequence[Chart], events: Sequence[float]) -> str:
+    """Returns charts over times in s, `(T,)`, and the times of events, as JSON that is safe inside a script element."""
+    step = max(1, len(times) // SAMPLES)
     drawn = []
-    for chart in charts(log, robots, recordings[0].period, clearance):
+    for chart in found:
         values = [curve.values[::step] for curve in chart.curves]
         known = np.concatenate([*values, chart.least])
         known = known[np.isfinite(known)]
@@ -108,7 +107,7 @@ def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
                 ],
             }
         )
-    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": event_times(recordings)}
+    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": list(events)}
     return json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
 
 

@@ -66,7 +66,15 @@ class Chart(NamedTuple):
     least: tuple[float, float]
 
 
-def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | None = None) -> list[Chart]:
+def references_differ(log: Rows) -> bool:
+    """Tells whether the robots whose curves are drawn from a log, `(T, B)`, follow different references."""
+    drawn = log[:, :MAX_ROBOTS]
+    return any((np.abs(drawn[name] - drawn[name][:, :1]) > 0).any() for name in ("v_ref", "omega_ref"))
+
+
+def charts(
+    log: Rows, robots: Sequence[Look], period: float, clearance: Array | None = None, own_references: bool = False
+) -> list[Chart]:
     """Returns the charts of a log.
 
     Args:
@@ -74,6 +82,7 @@ def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | 
         robots: Look of each robot.
         period: Time between samples in s.
         clearance: Distance of each robot from the nearest obstacle in m, `(T, B)`; None where there are no obstacles.
+        own_references: Whether each robot has a reference of its own, which is then drawn in its colour.
     """
     shown = range(min(len(robots), MAX_ROBOTS))
 
@@ -84,7 +93,10 @@ def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | 
         return [Curve(f"{robots[r].label} {quantity}", robots[r].colour, dashed, values[r]) for r in shown]
 
     def tracked(title: str, name: str, least: tuple[float, float]) -> Chart:
-        reference = Curve("reference", REFERENCE_COLOUR, False, signal(f"{name}_ref", 0))
+        if own_references:
+            references = each(f"{name} reference", [signal(f"{name}_ref", r) for r in shown], dashed=True)
+        else:
+            references = [Curve("reference", REFERENCE_COLOUR, False, signal(f"{name}_ref", 0))]
         estimated = [
             Curve(
                 f"{robots[r].label} {name} estimated",
@@ -95,7 +107,7 @@ def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | 
             )
             for r in shown
         ]
-        return Chart(title, [reference, *estimated, *each(name, [signal(name, r) for r in shown])], least)
+        return Chart(title, [*references, *estimated, *each(name, [signal(name, r) for r in shown])], least)
 
     def voltages(title: str, sign: float) -> Chart:
         parts = {
@@ -146,8 +158,8 @@ def _moving_mean(values: Array, window: int) -> Array:
 class Plots:
     """The uPlot charts of a page.
 
-    There is a set of charts for each number of robots so far, with and without obstacles, of which one is visible; as
-    in `Controls`, nothing is removed.
+    There is a set of charts for each number of robots so far, with and without obstacles and references of their own,
+    of which one is visible; as in `Controls`, nothing is removed.
 
     Attributes:
         time: Input of a time in s to go to, which a click on a curve sets, too.
@@ -156,7 +168,7 @@ class Plots:
     def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, zoom: bool = True) -> None:
         """Takes the GUI of the page and the tab for the charts; `zoom` lets a visitor zoom in along the time."""
         self._gui, self._tab, self._zoom = gui, tab, zoom
-        self._sets: dict[tuple[int, bool], list[viser.GuiUplotHandle]] = {}
+        self._sets: dict[tuple[int, bool, bool], list[viser.GuiUplotHandle]] = {}
         with tab:
             self._legend = gui.add_html("")
             self._score = gui.add_html("")
@@ -165,25 +177,27 @@ class Plots:
             self._lessons = gui.add_html("", order=LAST_PLACE)
             self.time = gui.add_number(TIME, 0.0, min=0.0, step=0.01, hint="A click on a curve sets it, too.")
 
-    def set_robots(self, robots: Sequence[Look], period: float, obstacles: bool) -> None:
+    def set_robots(self, robots: Sequence[Look], period: float, obstacles: bool, own_references: bool = False) -> None:
         """Sets the robots whose curves `show` will draw.
 
         Args:
             robots: Look of each robot.
             period: Time between samples in s.
             obstacles: Whether there are obstacles, so that the clearance is drawn.
+            own_references: As in `charts`.
         """
-        self._robots, self._period, self._obstacles = robots, period, obstacles
-        self._legend.content = legend(robots)
+        self._robots, self._period, self._obstacles, self._own_references = robots, period, obstacles, own_references
+        self._legend.content = legend(robots, own_references)
         size = min(len(robots), MAX_ROBOTS)
-        drawn = charts(blank(2, size), robots[:size], period, self._nowhere())
-        if (size, obstacles) not in self._sets:
+        drawn = charts(blank(2, size), robots[:size], period, self._nowhere(), own_references)
+        chosen = size, obstacles, own_references
+        if chosen not in self._sets:
             with self._tab:
-                self._sets[size, obstacles] = [_add(self._gui, chart, self._zoom) for chart in drawn]
+                self._sets[chosen] = [_add(self._gui, chart, self._zoom) for chart in drawn]
         for key, handles in self._sets.items():
             for handle in handles:
-                handle.visible = key == (size, obstacles)
-        self._handles = self._sets[size, obstacles]
+                handle.visible = key == chosen
+        self._handles = self._sets[chosen]
         for handle, chart in zip(self._handles, drawn, strict=True):
             if handle.series != (series := _series(chart)):
                 handle.series = series
@@ -216,7 +230,8 @@ class Plots:
         for first in np.searchsorted(drawn, events):
             if 0 < first < len(drawn):
                 marks[first] = 1
-        for handle, chart in zip(self._handles, charts(log, self._robots, self._period, clearance), strict=True):
+        found = charts(log, self._robots, self._period, clearance, self._own_references)
+        for handle, chart in zip(self._handles, found, strict=True):
             values = [time, *(curve.values for curve in chart.curves)]
             _send(handle, (*(v[within][::step].astype(np.float32) for v in values), marks))
 
@@ -242,11 +257,12 @@ class Plots:
         self._cursor.content = f"<style>{over}{{overflow:hidden}}{over}::after{{{line}}}</style>"
 
 
-def legend(robots: Sequence[Look]) -> str:
-    """Returns the legend of robots and their colours in HTML."""
+def legend(robots: Sequence[Look], own_references: bool) -> str:
+    """Returns the legend of robots and their colours in HTML; `own_references` is as in `charts`."""
     whole = "display:inline-block;color:rgb"  # a line ends between keys
     keys = [f'<span style="{whole}{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
     keys += [f'<span style="{whole}{REFERENCE_COLOUR}">■ reference</span>']
+    keys += ["V, θ̇: reference of each robot dashed."] * own_references
     keys += [f'<span style="{whole}{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
     keys += ["Σ, Δ: feedback solid, feedforward dashed. Time in s."]
     if len(robots) > MAX_ROBOTS:

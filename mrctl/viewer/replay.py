@@ -12,7 +12,7 @@ from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
 from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
-from mrctl.viewer.plots import Plots
+from mrctl.viewer.plots import Plots, references_differ
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import Scatter, meaning, numbers_of
 from mrctl.viewer.scene import Scene
@@ -106,7 +106,8 @@ class ReplayPage(Page):
         obstacles = recordings[0].scenario.obstacles
         self._scene = Scene(self.server, recordings[0].model, robots, obstacles)
         times, self._log, self._clearance = joint_log(recordings)
-        self._plots.set_robots(robots, recordings[0].period, self._clearance is not None)
+        walls, apart = self._clearance is not None, references_differ(self._log)
+        self._plots.set_robots(robots, recordings[0].period, walls, apart)
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
         self._times, self._events = times, event_times(recordings)

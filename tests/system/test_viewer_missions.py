@@ -31,7 +31,8 @@ from mrctl.viewer.cameras import FILLED_SHARE
 from mrctl.viewer.export import _curves
 from mrctl.viewer.live import SAMPLES, WINDOW, Live
 from mrctl.viewer.page import arrivals
-from mrctl.viewer.recording import Library, looks_of
+from mrctl.viewer.plots import charts
+from mrctl.viewer.recording import Library, joint_log, looks_of
 from mrctl.viewer.replay import ReplayPage
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import Session
@@ -125,7 +126,9 @@ def test_replay_of_a_mission(server, tmp_path):
         known = curve[np.isfinite(curve)]
         least = np.float32(mission.table["clearance"].iloc[row])  # as numbers of curves are
         assert least <= known.min() < least + 0.01
-    written = json.loads(_curves(replay.recordings, looks_of(replay.recordings, [0, 1])))["charts"]
+    times, log, clearance = joint_log(replay.recordings)
+    found = charts(log, looks_of(replay.recordings, [0, 1]), replay.recordings[0].period, clearance)
+    written = json.loads(_curves(times, found, []))["charts"]
     chart = next(chart for chart in written if chart["title"] == "clearance, m")
     exported = [min(v for v in curve["values"] if v is not None) for curve in chart["curves"]]
     assert exported == pytest.approx(mission.table["clearance"], abs=0.01)
@@ -140,7 +143,7 @@ def test_replay_of_different_goals(server, tmp_path):
     )
     tasks = [Task(obstacles=WALLS, start=start, goal=goal) for start, goal in places]
     drives = [prepared(task, PID)[1].replace(name=f"{k}") for k, task in enumerate(tasks)]
-    save(simulate(drives), tmp_path / "result.zarr")
+    save(result := simulate(drives), tmp_path / "result.zarr")
     replay = ReplayPage(Library(tmp_path / "result.zarr"), [0, 1, 2], server)
     replay._scrub(replay.duration)
     replay.draw()
@@ -155,9 +158,18 @@ def test_replay_of_different_goals(server, tmp_path):
     assert {label.anchor for label in replay._scene.robots._labels} == {
         "bottom-center"
     }  # above the robot, not beside it
+    chart = replay._plots._handles[0]
+    curves = dict(zip([series["label"] for series in chart.series], chart.data, strict=True))
+    assert "reference" not in curves and "reference of each robot dashed" in replay._plots._legend.content
+    for k in range(3):
+        planned = result["v_ref"][k].interp(time=curves["s"]).values
+        driven = np.isfinite(planned)
+        assert driven.sum() > 30
+        np.testing.assert_allclose(curves[f"{k} v reference"][driven], planned[driven], atol=1e-3)
     replay._show([1])
     replay.draw()
     assert [mark.position[1] for mark in replay._scene.navigation._ends if mark.visible] == pytest.approx([-1.5, -1.5])
+    assert "reference" in [series["label"] for series in replay._plots._handles[0].series]
 
 
 def numbers(page):
