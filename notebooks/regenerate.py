@@ -25,13 +25,16 @@ def executed(path: Path, folder: Path, kernel: KernelManager) -> nbformat.Notebo
     """Returns a notebook after a run in a folder, with all outputs; an exception in a cell is raised.
 
     The kernel first forgets the names of the notebook before. It starts once for all notebooks, because the imports and
-    the compiled laws take seconds.
+    the compiled laws take seconds, and goes on counting; here the cells are counted from 1.
     """
     notebook = nbformat.read(path, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n__spec__ = None\n%cd -q {folder}"))
     # The kernel sends what a cell prints in as many pieces as the load of the machine makes.
     NotebookClient(notebook, km=kernel, timeout=600, record_timing=False, coalesce_streams=True).execute()
     del notebook.cells[0]
+    for count, cell in enumerate((cell for cell in notebook.cells if cell.cell_type == "code"), 1):
+        for counted in (cell, *(output for output in cell.outputs if "execution_count" in output)):
+            counted.execution_count = count
     return notebook
 
 

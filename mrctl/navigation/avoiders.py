@@ -11,7 +11,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.navigation.generators import Task
 from mrctl.navigation.hybrid_astar import NoWay
-from mrctl.navigation.mppi import Mppi
+from mrctl.navigation.mppi import LAG, Mppi
 from mrctl.navigation.pacing import Pacing
 from mrctl.navigation.planning import REACTIVE, REPLAN_MARGIN, Avoid, Query, planned
 from mrctl.navigation.replanning import open_waypoints
@@ -24,7 +24,7 @@ from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 
 
-def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
+def avoiding(avoid: Avoid, *, lag: float = LAG) -> Callable[[Robot, int], Any] | None:
     """Returns the factory of the motion stage of missions, which bears the name in tables; None for that of mrctl.
 
     The scenarios that it drives are those that `prepared` returns for the same `avoid`; their missions may differ.

@@ -22,6 +22,7 @@ ORDINARY_SPEED = 0.2  # m/s, largest V below which λ falls as V², as the costs
 MAX_COST_DIFFERENCE = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
 SHOWN_SAMPLES = 40  # of the samples, which are kept to be looked at
 SAMPLE_DEVIATIONS = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
+LAG = 0.06  # s, of the roll-outs by default, two to three times that of the robots; chosen
 MAX_LAG = 10.0  # s
 MAX_LEFT = 0.5  # share of the way to its target that may be left at the end of a roll-out that gets on; chosen
 
@@ -29,7 +30,7 @@ MAX_LEFT = 0.5  # share of the way to its target that may be left at the end of 
 class Mppi(Reactive):
     """A motion stage that samples twists around those of the period before; the same noise for every robot."""
 
-    def __init__(self, robot: Robot, size: int, replan: Replan, lag: float = 0.0) -> None:
+    def __init__(self, robot: Robot, size: int, replan: Replan, lag: float = LAG) -> None:
         """Takes the arguments of `Reactive`, and the lag that the roll-outs assume.
 
         Args:

@@ -74,6 +74,8 @@ def test_notebook(path, kernel, tmp_path):
         assert NUMBER.sub("#", found).split() == NUMBER.sub("#", kept).split()
         numbers = (np.array(NUMBER.findall(text), float) for text in (found, kept))
         np.testing.assert_allclose(*numbers, rtol=0.01, atol=0.01)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     outputs = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", ())]
     pictures = [Image.open(io.BytesIO(base64.b64decode(data["image/png"]))) for data in outputs if "image/png" in data]
     assert len(pictures) >= 2 and all(np.unique(one.convert("L")).size > 10 for one in pictures)
