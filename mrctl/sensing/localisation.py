@@ -128,9 +128,12 @@ class Localiser:
                 best, _ = best_of(poses, points, rays, chart, self._random[row])
                 found, share = best[0], agreement.compiled(points, best[0], chart)
                 now["fix_arrives"][row] &= share >= MIN_AGREEMENT
-                self._sought[row] = best if share >= MIN_AGREEMENT else poses
-                if begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED_DISTANCE:
+                if share < MIN_AGREEMENT:  # such as a scan that shows nothing, which is no reason to end the search
+                    self._sought[row] = poses
+                elif begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED_DISTANCE:
                     self._sought[row] = None
+                else:
+                    self._sought[row] = best
             elif not begun[row]:  # there is no estimate yet
                 now["fix_arrives"][row] = False
                 continue

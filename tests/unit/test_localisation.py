@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from test_obstacles import random_shapes
 
-from mrctl import Box, Disc, Obstacles
+from mrctl import Box, Disc, Obstacles, Sensing
 from mrctl.sensing.lidar import Lidar
+from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.particles import MAX_PARTICLES, MIN_PARTICLES, Particles, is_free
 from mrctl.sensing.scan_matching import match
+from mrctl.sensing.scanner import Scanner
+from mrctl.sensing.sensors import Sensors
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import at, field_of
 from mrctl.theory.obstacles import Surroundings, turned
@@ -238,3 +241,25 @@ def test_moving_things():
         ranges = np.minimum(ranges, LIDAR.scan(pose, passer, room.random))
         found = track.update(0.0, 0.0, *seen(ranges))
     assert errors(found, pose)[0] < 0.04
+
+
+def test_search_outlasts_scans_that_show_nothing():
+    """A robot that starts where its lidar sees nothing still looks for its place when the lidar sees the room."""
+    sides = ((3.5, 0), (-3.5, 0), (0, 3.5), (0, -3.5))
+    walls = [Box(x=x, y=y, length=0.2 + 7 * (x == 0), width=0.2 + 7 * (y == 0)) for x, y in sides]
+    known = Obstacles(shapes=(*walls, Disc(x=-2.5, y=2.0, radius=0.4), Box(x=2, y=2.5, length=1.5, width=0.5)))
+    sensing = [Sensing(localisation="scan", start_position_noise=0.3, start_heading_noise=1.0)]
+    pose, wrong = np.array([0.5, -1.0, 0.2]), np.array([[0.2, -0.7, -1.0, 0.0, 0.0]])
+    for seed in range(5):
+        sensors, scanner = Sensors(sensing, [seed], 0.01), Scanner(sensing, 0.01, [known])
+        localiser = Localiser(sensing, sensors, scanner, 0.1, [known])
+        localiser.start(0, wrong[0, :3], np.array([0.3, 0.3, 1.0]), seed)
+        for tick in range(0, 60, 10):
+            sees = tick >= 30
+            ranges = LIDAR.scan(pose, Surroundings(known).at(0.0), np.random.default_rng(tick))
+            scanner.scans[0], scanner.taken[0] = ranges if sees else np.full(LIDAR.beams, np.inf), tick
+            now = sensors.ring[tick % len(sensors.ring)]
+            now["fix_arrives"] = True
+            localiser.locate(tick, wrong)
+            assert now["fix_arrives"][0] == sees
+        assert errors(now["fix"][0], pose) == pytest.approx([0.0, 0.0], abs=0.05)
