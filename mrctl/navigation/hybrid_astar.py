@@ -331,9 +331,10 @@ def is_free(pose: Array, where: Space, sides: Array) -> bool:
         ahead, aside, radius = where.discs[k]
         x, y = pose[0] + c * ahead - s * aside, pose[1] + s * ahead + c * aside
         distance = value(field.distance, field.origin[0], field.origin[1], field.resolution, x, y)
-        # A field that is interpolated may be too large by half a cell at most, and on the map too small by 1/√2 cells.
-        clear &= distance - field.resolution / 2 > radius + where.margin
-        if distance + field.resolution / np.sqrt(2) < where.depths[k] + where.margin and on_map(x, y, field):
+        # On the map a field that is interpolated may be too large by half a cell and too small by 1/√2 cells at most.
+        known = on_map(x, y, field)
+        clear &= known and distance - field.resolution / 2 > radius + where.margin
+        if known and distance + field.resolution / np.sqrt(2) < where.depths[k] + where.margin:
             return False
     if clear:
         return True

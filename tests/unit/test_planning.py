@@ -409,6 +409,21 @@ def test_refused(start, goal, message):
     assert "\n" not in str(error.value)
 
 
+def test_nose_beyond_the_border():
+    """Where the robot reaches beyond the area in which P may be, it keeps the margin from what is there, too."""
+    random, sides, found = np.random.default_rng(0), np.empty((4, 4)), []
+    for _ in range(20):
+        shapes = random_shapes(random, 6)
+        where = prepared(shapes, 1.5)
+        for _ in range(100):
+            pose = random.uniform([-1.5, -1.5, -np.pi], [1.5, 1.5, np.pi])
+            body = shapely.Polygon(turned(FOOTPRINT, pose))
+            keeps = min(body.distance(judged(shape)) for shape in shapes.shapes) > where.margin
+            assert hybrid_astar.is_free.compiled(pose, where, sides) == keeps
+            found.append(keeps)
+    assert 0.1 < np.mean(found) < 0.9
+
+
 @pytest.mark.parametrize("width", [2.0, 4.0, 9.0])
 @pytest.mark.parametrize("robot", ["car", "turtlebot"])
 def test_around_the_border(robot: str, width: float):
