@@ -135,7 +135,7 @@ def navigate(
     others = [own.with_feedforward(name) for name in compare]
     result = simulate([own, *others], progress=progress, motion=avoiding(avoid))
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
-    result = result.isel(time=slice(int(driven[-1]) + 1))
+    result = result.isel(time=slice(int(driven.max(initial=0)) + 1))
     return Mission(found, result, outcomes(result, task.goal, found), planning_time)
 
 

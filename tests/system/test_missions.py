@@ -141,6 +141,16 @@ def test_failure_in_the_first_tick() -> None:
     assert "no twist" in row.outcome and row.length == row.spl == row.energy == 0 and np.isnan(row.position_rmse)
 
 
+def test_collision_in_the_first_tick() -> None:
+    """A robot that something drives into at once has collided, and there is a result of it."""
+    course = mrctl.Line(heading=np.pi, speed=1.4)
+    mover = Disc(x=-0.55, radius=0.1, course=course)  # from (0.55, 0) towards the robot, whose nose is at 0.44 m
+    task = Task(obstacles=Obstacles(shapes=(mover,)), start=(0.0, 0.0, 0.0), goal=(2.0, 0.0, 0.0))
+    mission = navigate(task, Scenario(prior="model", learner="none"))
+    assert mission.table["outcome"].tolist() == ["collided"] and mission.table["length"].tolist() == [0.0]
+    assert mission.result.sizes["time"] == 1 and not np.isfinite(mission.result["x"]).any()
+
+
 def test_ends() -> None:
     """A run ends where the robot rests at its goal, or is stuck; alone it has the bits that it has beside others."""
     line = mrctl.Waypoints(points=((0, 0), (1, 0), (2, 0)), closed=False, timing="limits", speed=0.8)
