@@ -39,8 +39,8 @@ def avoiding(avoid: Avoid, *, lag: float = LAG) -> Callable[[Robot, int], Any] |
     def replan(
         scenario: Scenario, vehicle: Vehicle, pose: Array, twist: Array, outlines: Outlines, given: Waypoints | None
     ) -> Waypoints | None:
-        plan = open_waypoints(scenario.reference)
-        goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
+        plan = given or open_waypoints(scenario.reference)
+        goal = scenario.goal if scenario.goal and given is None else end_of(plan)
         x, y, theta = pose.tolist()
         here = x, y, remainder(theta, 2 * pi)
         start = Task.from_dict({"obstacles": scenario.known, "start": here, "goal": goal})

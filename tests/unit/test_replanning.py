@@ -142,3 +142,22 @@ def test_turned_more_than_once() -> None:
     plain, turned = (planner.plan(pose + [0, 0, turns * 2 * np.pi], REST, 0.0) for turns in (0, -3))
     assert plain is not None and turned is not None
     np.testing.assert_allclose(turned.points, plain.points, atol=1e-9)
+
+
+def test_speed_of_the_way() -> None:
+    """A plan to the end of a way that an event brought is as fast as that way, and not as the plan of the mission."""
+    own = Scenario(prior="model", learner="none")
+    _, drive = prepared(task_of("doorway:3", own), own, speed=1.0, avoid="barrier")
+    made = avoiding("barrier")
+    assert made is not None
+    stage = made(Vehicle.of(own).robot, 1)
+    stage.assign([drive])
+    (planner,) = stage._planners
+    x, y, theta = drive.initial_pose or (0.0, 0.0, 0.0)
+    way = Waypoints(points=((x, y), (x + 1.0, y)), closed=False, timing="limits", speed=0.3)
+    before = planner.plan(np.array((x, y, theta)), REST, 0.0)
+    planner.take(way, 0.0)
+    after = planner.plan(np.array((x, y, theta)), REST, 0.0)
+    assert before is not None and before.speed == 1.0 and after is not None
+    times = np.linspace(0.0, after.period, 200)
+    assert after.sample(times).twist[:, 0].max() == pytest.approx(0.3, rel=0.02)
