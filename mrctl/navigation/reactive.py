@@ -43,6 +43,7 @@ class Agent:
 
     Attributes:
         planner: Its mission, and what it knows.
+        bounds: What twists it can drive; the largest V is that of the way that it was given last.
         last: The twist that it was last asked for, V in m/s and θ̇ in rad/s, `(2,)`.
         passes: Whether the twists that were chosen last lead around what blocks its plan.
     """
@@ -60,14 +61,14 @@ class Agent:
             start: x and y in m where it is, `(2,)`.
             period: Motion period in s.
         """
-        self.planner, self._bounds, self._discs = planner, bounds, discs
+        self.planner, self.bounds, self._discs = planner, bounds, discs
         self._field, self._reach, self._period = field, reach(discs), period
         self.last, self.passes = np.zeros(2), False
         self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
         self._anchor = start.copy()  # where it last was when it had got on
         self._replanned = False  # whether it has made another plan since
         self._arrived = np.inf  # when it arrived at the end of its plan
-        self._trail = Trail(planner.vehicle.footprint, min(BACK[1], bounds.speed / 2), bounds.curvature)
+        self._trail = Trail(planner.vehicle.footprint, bounds.curvature)
         self._pieces = 0  # of the way back from `_anchor`, while it goes back
         self._approached = False  # whether it has gone back from a goal at which it did not arrive
 
@@ -79,7 +80,9 @@ class Agent:
 
     def follow(self, plan: Reference, now: float) -> None:
         """Takes a plan to another goal at a time in s."""
-        self._take(self.planner.take(plan, now))
+        taken = self.planner.take(plan, now)
+        self.bounds = self.bounds._replace(speed=taken.speed)
+        self._take(taken)
         self._replanned = self._approached = False
         self._pieces = 0
 
@@ -112,7 +115,7 @@ class Agent:
         places = self._place + SAMPLES_PER_PERIOD * np.arange(1, STEPS + 1)
         targets, end = self._table[np.minimum(places, last)], 1 + int(np.searchsorted(places, last))
         found, horizon = self.planner.sight.discs(now), self._period * STEPS
-        far = self._reach + horizon * (self._bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
+        far = self._reach + horizon * (self.bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
         near = found[np.hypot(*(found[:, :2] - pose[:2]).T) < far]
         return Scene(targets, self._discs, self._field, near, end)
 
@@ -183,7 +186,7 @@ class Agent:
         """
         if self._at_end(pose):
             self.planner.got_on, self.planner.blocked = now, np.inf
-        if self._gone(pose) > min(MIN_HEADWAY[0], MIN_HEADWAY[1] * HEADWAY_TIME * self._bounds.speed):
+        if self._gone(pose) > min(MIN_HEADWAY[0], MIN_HEADWAY[1] * HEADWAY_TIME * self.bounds.speed):
             self._anchor, self.planner.got_on, self._replanned = pose[:2].copy(), now, False
         blocked = self.planner.is_blocked(now) and not self.passes
         needs = blocked or self._away > MAX_PLAN_DISTANCE or self._waits(now)
@@ -213,7 +216,8 @@ class Agent:
 
     def _back(self, pose: Array, now: float) -> bool:
         """Lets `last` be the twist with which it goes back; returns whether it can."""
-        twist = self._trail.back(pose, self.planner.sight.outlines(now, BACK_CLEARANCE - PLACE_RADIUS))
+        outlines = self.planner.sight.outlines(now, BACK_CLEARANCE - PLACE_RADIUS)
+        twist = self._trail.back(pose, min(BACK[1], self.bounds.speed / 2), outlines)
         if twist is not None:
             self.last = twist
         return twist is not None
@@ -246,7 +250,7 @@ class Reactive(ABC):
     help, it goes back a little on its `Trail`, and plans again.
 
     Attributes:
-        bounds: What twists each robot can drive.
+        bounds: What twists each robot can drive, as of its `Agent`.
         considered: What led to the last twist of each robot; None before the first one, and while it goes back.
     """
 
@@ -263,12 +267,12 @@ class Reactive(ABC):
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
         self._planners = Planner.each(self._replan, scenarios)
-        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
+        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
         discs, fields = cover(self._planners[0].vehicle.footprint, *BODY_DISCS), dict[Hashable, Field]()
         for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
             planner.reset()
@@ -280,6 +284,7 @@ class Reactive(ABC):
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
         self._agents[row].follow(plan, self._period * self._tick)
+        self.bounds[row] = self._agents[row].bounds
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.MotionStage`."""

@@ -190,7 +190,8 @@ def roll_out(
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
             turning = nominal[k, 1] + (1 - share) * knots[n, i, 1] + share * knots[n, i + 1, 1]
             change = bounds.acceleration * step
-            v = min(max(min(max(wanted, v - change), v + change), 0.0), bounds.speed)
+            fastest = max(bounds.speed, v - change)  # a robot on a slower way than before brakes
+            v = min(max(min(max(wanted, v - change), v + change), 0.0), fastest)
             change = bounds.rotation_acceleration * step
             omega = min(max(turning, omega - change), omega + change)
             most = min(bounds.rotation, bounds.curvature * v)

@@ -25,15 +25,14 @@ CHECKED_BEHIND = 0.1  # distance in m behind the robot within which it looks for
 class Trail:
     """The way that one robot came."""
 
-    def __init__(self, footprint: Array, speed: float, curvature: float) -> None:
+    def __init__(self, footprint: Array, curvature: float) -> None:
         """Begins an empty trail.
 
         Args:
             footprint: Corners of the robot in its frame in m, `(n, 2)`.
-            speed: Speed in m/s with which it goes back.
             curvature: Largest |θ̇| / |V| in 1/m.
         """
-        self._footprint, self._speed, self._curvature = footprint, speed, curvature
+        self._footprint, self._curvature = footprint, curvature
         self._places = deque[Array](maxlen=MAX_PLACES)
 
     def add(self, pose: Array) -> None:
@@ -41,11 +40,12 @@ class Trail:
         if not self._places or np.hypot(*(pose[:2] - self._places[-1])) > PLACE_SPACING:
             self._places.append(pose[:2].copy())
 
-    def back(self, pose: Array, outlines: Outlines) -> Array | None:
+    def back(self, pose: Array, speed: float, outlines: Outlines) -> Array | None:
         """Returns the twist with which the robot goes back, V in m/s and θ̇ in rad/s, `(2,)`.
 
         Args:
             pose: x and y in m and θ in rad, `(3,)`.
+            speed: Speed in m/s with which it goes back.
             outlines: The obstacles.
 
         Returns:
@@ -60,4 +60,4 @@ class Trail:
         curvature = np.clip(2 * y / (x * x + y * y), -self._curvature, self._curvature)
         if clearance(self._footprint, pose - CHECKED_BEHIND * np.array([c, s, curvature]), outlines) <= 0:
             return None
-        return -self._speed * np.array([1.0, curvature])
+        return -speed * np.array([1.0, curvature])

@@ -32,7 +32,8 @@ class Window(Reactive):
         """Returns the first twist towards the best one of the window."""
         bounds = self.bounds[row]
         reach, turn = REACH_TIME * bounds.acceleration, REACH_TIME * bounds.rotation_acceleration
-        speeds = np.linspace(max(0.0, last[0] - reach), min(bounds.speed, last[0] + reach), SPEED_SAMPLES)
+        slowest = max(0.0, last[0] - reach)
+        speeds = np.linspace(slowest, max(slowest, min(bounds.speed, last[0] + reach)), SPEED_SAMPLES)
         rotations = np.linspace(
             max(-bounds.rotation, last[1] - turn), min(bounds.rotation, last[1] + turn), ROTATION_SAMPLES
         )

@@ -20,6 +20,7 @@ from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.rays import Scan
+from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import RobotFile
 
 PLANNED = Scenario(prior="model", learner="none")
@@ -374,3 +375,30 @@ def test_limits() -> None:
             assert 0 <= v <= robot.max_speed and abs(omega) <= robot.max_rotation
             assert abs(omega) <= v * np.tan(robot.steering_limit) / robot.wheelbase + 1e-12
             pose = pose + [[0.05 * v, 0.0, 0.05 * omega]] + random.normal(size=(1, 3)) * 0.05
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.3, 0.9), (0.9, 0.3)])
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_speed_of_another_way(avoid: Avoid, first: float, second: float) -> None:
+    """On another way a robot is as fast as that way, not as the plan of its mission; it changes its speed slowly."""
+    task = Task(obstacles=Obstacles(shapes=(Disc(x=5.0, y=3.0),)), start=(0.0, 0.0, 0.0), goal=(9.0, 0.0, 0.0))
+    _, drive = prepared(task, PLANNED, first, avoid=avoid)
+    made, robot = avoiding(avoid), Vehicle.of(drive).robot
+    assert made is not None
+    stage, period, speeds = made(robot, 1), drive.motion_period, []
+    stage.assign([drive])
+    pose, twist = np.zeros((1, 3)), np.zeros((1, 2))
+    stage.reset(pose, np.zeros((1, 7)), period)
+    for k in range(120):  # a unicycle that obeys at once
+        if k == 50:
+            x, y = pose[0, :2].tolist()
+            points = tuple((x + ahead, y) for ahead in range(9))
+            way = Waypoints(points=points, closed=False, timing="limits", speed=second, start_speed=min(first, second))
+            stage.follow(0, way)
+        twist = stage.output(pose, twist, np.zeros((1, 7)))
+        (v, omega), theta = twist[0], pose[0, 2]
+        pose = pose + period * np.array([v * np.cos(theta), v * np.sin(theta), omega])
+        speeds.append(v)
+    assert np.mean(speeds[40:50]) == pytest.approx(first, rel=0.1)
+    assert np.mean(speeds[-20:]) == pytest.approx(second, rel=0.1)
+    assert np.abs(np.diff(speeds)).max() <= robot.max_acceleration * period
