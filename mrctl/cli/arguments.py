@@ -27,6 +27,9 @@ SHORT_FLAGS = {"--robot": "--robot.path", "--localise": "--sensing.localisation"
 POSE_FLAGS = "--goal", "--start", "--initial-pose"
 """Flags whose values may be written as x,y,θ."""
 
+LIST_FLAGS = "--controller", "--feedforward", "--compare", "--delay", "--tier"
+"""Flags whose values stand behind one of them; of two of them tyro would take the last."""
+
 
 def expanded(arguments: list[str]) -> list[str]:
     """Expands short flags into full ones.
@@ -108,6 +111,19 @@ def refuse_known(arguments: Sequence[str]) -> None:
                 raise InputError(f"{name}: has no flag; set it in a scenario file, as for mrctl run scenario.toml")
             if arguments[0] == "navigate" and name in NOT_OF_MISSIONS and name != "goal":  # it has its own --goal
                 raise InputError(f"{name}: has no flag here, because the mission sets it")
+
+
+def refuse_twice(arguments: Sequence[str]) -> None:
+    """Refuses a second one of the flags that take several values, because it would replace those of the first.
+
+    Raises:
+        InputError: There is one; the message says how to give several values.
+    """
+    given = [argument.partition("=")[0] for argument in arguments]
+    for flag in LIST_FLAGS:
+        if given.count(flag) > 1:
+            how = "joined by commas" if (arguments[0], flag) == ("run", "--controller") else "one after another"
+            raise InputError(f"{flag.removeprefix('--')}: is given twice; its values stand behind one {flag}, {how}")
 
 
 def check_switches(arguments: Sequence[str]) -> None:

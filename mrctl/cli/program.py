@@ -17,7 +17,7 @@ from typing import Any
 import tyro
 
 from mrctl import __version__
-from mrctl.cli.arguments import expanded, one_line, refuse_known
+from mrctl.cli.arguments import expanded, one_line, refuse_known, refuse_twice
 from mrctl.cli.flags import further_flags, is_short_help
 from mrctl.cli.navigate import navigate_with
 from mrctl.cli.results import export, record, view_with
@@ -117,6 +117,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
     }
     if not arguments[0].startswith("-") and arguments[0] not in commands:
         raise InputError(f"no command is called {arguments[0]!r}; there are {', '.join(commands)}")
+    refuse_twice(arguments)
     complaints = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaints):

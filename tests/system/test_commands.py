@@ -333,6 +333,10 @@ def test_bad_scenario_is_one_line(
         (["suite", "--quick", "--seeds", "100001"], "seeds: the suite has the first 100,000"),
         (["dance"], "no command is called 'dance'; there are run, navigate, reproduce"),
         (["run", "--feedforward", "rls"], "feedforward: this field of an earlier version is gone"),
+        (["run", "--controller", "motion=a.py:A", "--controller=b.py:B"], "controller: is given twice; its values"),
+        (["run", "--controller", "a.py:A", "--controller", "b.py:B"], "behind one --controller, joined by commas"),
+        (["suite", "--feedforward", "fel", "--feedforward", "none"], "one --feedforward, one after another"),
+        (["tune", "--delay", "0", "--delay", "0.01"], "delay: is given twice"),
     ],
 )
 def test_bad_flags_are_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture) -> None:
