@@ -21,7 +21,7 @@ NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 WITH_RECORDS = "run", "navigate", "identify", "view"
 """Commands whose short help leaves out most of the flags of a record."""
 
-SHORT_FLAGS = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
+SHORT_FLAGS = {"--robot": "--robot.path", "--sensing": "--sensing.tier", "--localise": "--sensing.localisation"}
 """Flags that stand for longer ones."""
 
 POSE_FLAGS = "--goal", "--start", "--initial-pose"
@@ -103,10 +103,14 @@ def refuse_known(arguments: Sequence[str]) -> None:
     """
     if arguments[0] not in WITH_RECORDS:
         return
-    for flag in arguments:
+    for place, flag in enumerate(arguments):
         if flag.startswith("--"):
             name = flag[2:].partition("=")[0].replace("-", "_")
             Scenario.refuse_moved(name)
+            behind = any(before.startswith("reference:") for before in arguments[:place])
+            if arguments[0] in ("run", "view") and name.split(".")[0] == "reference" and not behind:
+                how = "a reference comes last, and its flags behind it, as in reference:circle --reference.radius 0.8"
+                raise InputError(f"{flag[2:]}: {how}")
             if name in FROM_FILES:
                 raise InputError(f"{name}: has no flag; set it in a scenario file, as for mrctl run scenario.toml")
             if arguments[0] == "navigate" and name in NOT_OF_MISSIONS and name != "goal":  # it has its own --goal
@@ -183,7 +187,11 @@ def one_line(box: str, command: str) -> str:
     if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
         if match[3]:
             return f"{match[1]}: is no flag of{match[3]}, and those of mrctl {match[2]} stand before it"
-        return f"{match[1]}: is no flag of mrctl {match[2]}"
+        robot = match[1].startswith("--robot.") and command in ("check", "tune")
+        instead = f"; the robot stands without a flag, as in mrctl {command} turtlebot" if robot else ""
+        return f"{match[1]}: is no flag of mrctl {match[2]}{instead}"
+    if command in ("run", "view") and (match := re.match(r"Unrecognized options: (\S+\.toml)", text)):
+        return f"{match[1]}: one scenario file may be given, in front of the reference"
     if match := re.match(r"Unrecognized options: (\S+\.xml)", text):
         return f"{match[1]}: the file of a robot is given as --robot {match[1]}"
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):

@@ -44,7 +44,8 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
 
         The exit status is 1 if the first robot does not arrive. Its controller is that of --prior and --learner, with
         the defaults of `mrctl run` where one of them is given, and model+composite where none is. --robot NAME stands
-        for --robot.path NAME, and --localise NAME for --sensing.localisation NAME.
+        for --robot.path NAME, --sensing TIER for --sensing.tier TIER, and --localise NAME for --sensing.localisation
+        NAME.
 
         Args:
             world: TOML file of obstacles, yaml file of a ROS map, world in SDF or MJCF, or a generator with a seed,

@@ -52,7 +52,8 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
             return _repeat_saved(file, arguments, out, json, controller)
         if file is not None and str(file) != scenario_file:
             check_switches(arguments)
-            raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
+            forms = "whose name ends in .toml, nor a reference, which is written as reference:circle"
+            raise InputError(f"run: {file} is not a scenario file, {forms}; see mrctl run --help")
         check_world(scenario.world, scenario.robot)
         from mrctl.kernel import announced_early
 

@@ -333,6 +333,12 @@ def test_bad_scenario_is_one_line(
         (["suite", "--quick", "--seeds", "100001"], "seeds: the suite has the first 100,000"),
         (["dance"], "no command is called 'dance'; there are run, navigate, reproduce"),
         (["run", "--feedforward", "rls"], "feedforward: this field of an earlier version is gone"),
+        (["run", "--reference", "circle"], "reference: a reference comes last, and its flags behind it"),
+        (["view", "--reference.radius", "2", "reference:circle"], "reference.radius: a reference comes last"),
+        (["run", "reference:circle", "--reference.radios", "2"], "did you mean --reference.radius?"),
+        (["run", "circle"], "nor a reference, which is written as reference:circle"),
+        (["run", "--sensing", "fild"], "sensing.tier: 'fild' is none of field, ideal, lab"),
+        (["tune", "--robot", "mule.xml"], "the robot stands without a flag, as in mrctl tune turtlebot"),
         (["run", "--controller", "motion=a.py:A", "--controller=b.py:B"], "controller: is given twice; its values"),
         (["run", "--controller", "a.py:A", "--controller", "b.py:B"], "behind one --controller, joined by commas"),
         (["suite", "--feedforward", "fel", "--feedforward", "none"], "one --feedforward, one after another"),
@@ -342,6 +348,17 @@ def test_bad_scenario_is_one_line(
 def test_bad_flags_are_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture) -> None:
     """Every kind of bad flag ends with one line that names it."""
     assert says in refused(capsys, *arguments)
+
+
+def test_scenario_file_behind_the_reference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """One line says where the file belongs."""
+    monkeypatch.chdir(tmp_path)
+    Path("a.toml").write_text("laps = 1")
+    assert "a.toml: one scenario file may be given, in front of the" in refused(
+        capsys, "run", "reference:line", "a.toml"
+    )
 
 
 @pytest.mark.parametrize("arguments", [["run", "--help"], ["run", "--laps", "0"]])
