@@ -24,7 +24,7 @@ from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.learned import LAYOUT
 from mrctl.loop.log import MAX_LATERAL_ERROR, Log
 from mrctl.loop.user_hierarchy import UserHierarchy
-from mrctl.loop.user_stages import StageError, UserEstimator, UserFeedforward, UserStage
+from mrctl.loop.user_stages import StageError, UserEstimator, UserFeedforward, UserStage, name_of
 from mrctl.physics import hull, mjcf, tyres
 from mrctl.physics import obstacles as walls
 from mrctl.physics.plant import Plant, build
@@ -98,7 +98,7 @@ def simulate(
 
 def named_stages(stages: Stages) -> dict[str, str]:
     """Returns the names of the user's factories by stage."""
-    return {stage: getattr(factory, "__name__", "custom") for stage, factory in stages.items() if factory}
+    return {stage: name_of(factory) for stage, factory in stages.items() if factory}
 
 
 def titles(scenario: Scenario, stages: Mapping[str, str]) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,15 @@ class UserStage:
             size: Number of robots B.
 
         Raises:
-            StageError: There is no such stage, the factory raised, or its object lacks a method.
+            StageError: There is no such stage, the factory cannot be called or raised, or its object lacks a method.
         """
         if name not in METHODS:
             raise StageError(f"{name}: no such stage; there are {', '.join(METHODS)}")
-        called = getattr(factory, "__name__", type(factory).__name__)
+        called = name_of(factory)
         self.name, self.title = called.partition("(")[0], f"{name} {called}"
+        if not callable(factory):
+            wanted = "a class or a function, to be called with the robot and the number of robots"
+            raise StageError(f"{name}: expected {wanted}, not an object of {type(factory).__name__}")
         self.size = size
         try:
             self.stage: Any = factory(robot, size)
@@ -122,6 +126,14 @@ class UserStage:
         frames = traceback.extract_tb(error.__traceback__)[1:2]  # the line of the stage's own method
         place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in frames)
         return StageError(" ".join(f"{self.title}: {type(error).__name__}: {error}{place}".split()))
+
+
+def name_of(factory: object) -> str:
+    """Returns the name of a factory; for a `partial` that of its function, with the settings as in a call."""
+    if isinstance(factory, partial) and not hasattr(factory, "__name__"):
+        settings = [*map(repr, factory.args), *(f"{name}={value!r}" for name, value in factory.keywords.items())]
+        return f"{name_of(factory.func)}({', '.join(settings)})"
+    return getattr(factory, "__name__", type(factory).__name__)
 
 
 def _plain(answer: Any) -> Any:  # noqa: ANN401

@@ -1,6 +1,7 @@
 """A user's own stage replaces any of the four; an error in one is reported, and other runs are kept."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -436,12 +437,25 @@ def test_inputs_are_copies():
         ({"motion": Silent}, "motion Silent: has no method reset"),
         ({"feedforward": Kanayama}, "feedforward Kanayama: has no method learn"),
         ({"feedback": lambda robot, size: robot.nothing}, "feedback <lambda>: AttributeError: "),
+        ({"feedforward": "own.py:Mine"}, "feedforward: expected a class or a function, .* not an object of str"),
+        ({"motion": Silent(None, 1)}, "motion: expected a class or a function, .* not an object of Silent"),
     ],
 )
 def test_refused(own, message):
     """An object that is not a stage is refused before anything is computed."""
     with pytest.raises(InputError, match="(?s)^" + message.replace("<", "[<]")):
         simulate(SHORT, **own)
+
+
+def test_settings_in_the_label():
+    """Stages that differ in their settings alone are told apart, named as in the shell."""
+
+    class Tuned(Kanayama):
+        def __init__(self, robot, size, gain=1.0, name=""):
+            super().__init__(robot, size)
+
+    labels = [str(simulate(SHORT, motion=partial(Tuned, gain=g, name="a,b")).label.values) for g in (0.5, 2.0)]
+    assert labels == [f"none + Tuned(gain={g}, name='a,b')" for g in (0.5, 2.0)]
 
 
 def test_command_line(tmp_path, capsys):
