@@ -264,6 +264,12 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] in ("model_type", "model_attributes_type"):
         names = {one.named_by for one in _records_at(record, first["loc"])} - {""}
         message = ", or its ".join(["must be a record, or a table of its fields", *sorted(names)])
+        if isinstance(first["input"], tuple) and isinstance(first["loc"][-1], int):  # one record, field by field
+            field, message = field.rpartition(".")[0], "must be a list of records"
+    if first["type"] == "union_tag_not_found":
+        message = "must be a record, or a table of its fields, of which `kind` says what it is"
+    if first["type"] == "union_tag_invalid":
+        message = f"no kind is called {first['ctx']['tag']!r}; there are {first['ctx']['expected_tags']}"
     if first["type"] == "tuple_type":  # a file has no tuples
         tables = (
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""

@@ -342,7 +342,8 @@ class Waypoints(Record):
         gaps = np.abs(np.diff(plane(self.points, self.closed)))
         if gaps.min() < least:
             k = int(gaps.argmin())
-            raise ValueError(f"points: {k} and {(k + 1) % len(self.points)} coincide")
+            returns = "; a closed curve returns to the first by itself" if k + 1 == len(self.points) else ""
+            raise ValueError(f"points: {k} and {(k + 1) % len(self.points)} coincide{returns}")
         for name, curvature, gap in ((first, self.start_curvature, gaps[0]), (last, self.end_curvature, gaps[-1])):
             if abs(curvature) * gap >= 2:
                 raise ValueError(f"{name}: no arc through two points that are {gap:.2f} m apart has so much")

@@ -14,7 +14,7 @@ import mrctl
 from mrctl.record import InputError, Record
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.references import Line, Waypoints
+from mrctl.theory.references import Circle, Line, Waypoints
 
 
 class Inner(Record):
@@ -231,6 +231,20 @@ def test_names_in_the_place_of_records():
         ),
         ({"reference": "circle"}, "reference: must be a record, or a table of its fields"),
         ({"robot": 3}, "robot: must be a record, or a table of its fields, or its path"),
+        ({"events": Event(time=1, learning=False)}, "events: must be a list of records (and 7 more)"),
+        (
+            {"reference": Circle},
+            "reference: must be a record, or a table of its fields, of which `kind` says what it is",
+        ),
+        (
+            {"reference": {"radius": 1}},
+            "reference: must be a record, or a table of its fields, of which `kind` says what it is",
+        ),
+        (
+            {"reference": {"kind": "circel"}},
+            "reference: no kind is called 'circel'; there are 'line', 'circle', 'lemniscate', 'lane_change', "
+            "'rounded_square', 'stop_and_go', 'waypoints'",
+        ),
     ],
 )
 def test_misspelt(values, says):

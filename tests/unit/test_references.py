@@ -302,7 +302,10 @@ NARROW = [
         ({"kind": "waypoints", "points": [[0, 0], [1, 0]]}, "points: a closed curve needs at least 3"),
         ({"kind": "waypoints", "points": [[0, 0]], "closed": False}, "points: an open curve needs at least 2"),
         ({"kind": "waypoints", "points": [[0, 0], [1, 0], [1, 0], [0, 1]]}, "points: 1 and 2 coincide"),
-        ({"kind": "waypoints", "points": [[0, 0], [1, 0], [0, 1], [0, 0]]}, "points: 3 and 0 coincide"),
+        (
+            {"kind": "waypoints", "points": [[0, 0], [1, 0], [0, 1], [0, 0]]},
+            "points: 3 and 0 coincide; a closed curve returns",
+        ),
         ({"kind": "waypoints", "points": [[0, 0], [1, 0], [2, 0]]}, "points: the curve turns on the spot near"),
         # Here |dp/du| is above the least value at the 64 samples between two points, and below it between these.
         ({"kind": "waypoints", "points": NARROW}, r"points: the curve turns on the spot near \(-1.60, -0.00\)"),
