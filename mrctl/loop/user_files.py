@@ -61,7 +61,8 @@ def parts(name: str) -> list[Part]:
     for part in found:
         if not part.path.is_file():
             where = "" if Path(part.file).is_absolute() else f" in {Path.cwd()}"
-            raise InputError(f"controller: no file {part.file}{where}")
+            model = "; for the nominal model before it set prior to model" if part.file.startswith(MODEL_PREFIX) else ""
+            raise InputError(f"controller: no file {part.file}{where}{model}")
     return found
 
 
@@ -73,7 +74,7 @@ def split(name: str) -> list[Part]:
     """
     found: list[Part] = []
     for part in re.split(r",(?=[^,]*\.py:)", name):
-        place, _, call = part.partition(".py:")
+        place, _, call = part.strip().partition(".py:")
         stage, separator, file = f"{place}.py".partition("=")
         stage, file = (stage, file) if separator else ("feedforward", f"{place}.py")
         attribute, settings = _called(call)
