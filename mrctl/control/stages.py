@@ -66,7 +66,8 @@ class MotionStage(Protocol):
         """Returns the requested twist.
 
         Args:
-            pose: Estimated x, y in m and θ in rad, `(B, 3)`.
+            pose: Estimated x, y in m and θ in rad, `(B, 3)`; θ jumps by 2π at ±π, and θ_r, which is continuous, does
+                not.
             twist: Estimated V in m/s and θ̇ in rad/s, `(B, 2)`.
             reference: x_r and y_r in m, θ_r in rad, V_r in m/s, θ̇_r in rad/s, V̇_r in m/s², θ̈_r in rad/s², `(B, 7)`.
 
@@ -158,7 +159,8 @@ class EstimatorStage(Protocol):
             encoders: Angles of the rear wheels in the last samples that arrived, left and right, in rad, `(B, 2)`.
             gyro: θ̇ in the last sample of the gyro that arrived, in rad/s, `(B,)`.
             acceleration: Specific force in the last such sample, forward and to the left, in m/s², `(B, 2)`.
-            fix: Posture fix that arrived in this period in m, m, rad, `(B, 3)`; zeros where none did.
+            fix: Posture fix that arrived in this period in m, m, rad, `(B, 3)`, θ between −π and π; zeros where none
+                did.
             age: Age of that fix in s, `(B,)`; −1 where none arrived.
 
         Returns:
