@@ -146,7 +146,7 @@ class Examination:
         suspected = self.suspects
         repaired = self._repaired(check, suspected) if suspected else []
         if not _passes(repaired):
-            halved, finer = (_long_step(self._load(None), divisor) for divisor in (2, STEP_DIVISOR))
+            halved, finer = (long_step(self._load(None), divisor) for divisor in (2, STEP_DIVISOR))
             suspected = [*self.suspects, finer]
             repaired = self._repaired(check, suspected)
             improved = _excess_of(worst, self._repaired(check, [*self.suspects, halved])) < excess(worst)
@@ -207,12 +207,15 @@ def _passes(report: Report) -> bool:
     return bool(report) and all(c.passed for c in report)
 
 
-def _long_step(model: mujoco.MjModel, divisor: float) -> Suspect:
+def long_step(model: mujoco.MjModel, divisor: float) -> Suspect:
     """Makes a suspect of a time step that is too long, which no inspection can see."""
     h = 1e3 * model.opt.timestep
 
     def repair(faulty: mujoco.MjModel) -> None:
         faulty.opt.timestep /= divisor
 
-    text = f"the result changes with the time step and is right at {h / divisor:g} ms instead of {h:g} ms; shorten it"
+    text = (
+        f"the result changes with the time step and is right at {h / divisor:g} ms instead of {h:g} ms; shorten it, as "
+        f"with mrctl run --physics-step {h / divisor / 1e3:g}"
+    )
     return Suspect("time step too long", text, repair)

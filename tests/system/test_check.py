@@ -13,11 +13,12 @@ import pytest
 from mrctl.checks import command
 from mrctl.checks.catalogue import CHECKS
 from mrctl.checks.command import examination
-from mrctl.checks.examination import PREREQUISITES, Examination
+from mrctl.checks.examination import PREREQUISITES, Examination, long_step
 from mrctl.checks.inspections import suspects
 from mrctl.cli import main
 from mrctl.physics.files import models_folder
 from mrctl.physics.mjcf import load
+from mrctl.scenario import Scenario
 
 
 def messages(err):
@@ -361,3 +362,12 @@ def test_a_warning_is_said_once(tmp_path, monkeypatch, capfd):
     data.qacc_warmstart[:] = data.qvel[:] = 1e30
     mujoco.mj_step(model, data)
     assert data.warning.number.any() and not capfd.readouterr().err and len(list(tmp_path.iterdir())) == 1
+
+
+def test_advice_about_the_time_step():
+    """The flag of the advice sets the step at which the check passes; the robot's own file may not set it."""
+    model = load("flat")
+    suspect = long_step(model, 8)
+    suspect.repair(model)
+    flag, value = re.search(r"mrctl run --(\S+) (\S+)$", suspect.text).groups()
+    assert Scenario(**{flag.replace("-", "_"): value}).physics_step == model.opt.timestep
