@@ -179,6 +179,20 @@ class Record(BaseModel, metaclass=_Constructors):
             self.replace(**{name: (update or {})[name]})
         return super().model_copy(update=update, deep=deep)
 
+    if not TYPE_CHECKING:  # which knows that a record is frozen
+
+        def __setattr__(self, name: str, value: object) -> None:
+            """Refuses to change a field, in one line in place of the four of pydantic.
+
+            Raises:
+                InputError: The name is that of a field, or of none.
+            """
+            try:
+                super().__setattr__(name, value)
+            except ValidationError:
+                how = f"replace({name}=…) returns one with another value"
+                raise InputError(f"{name}: a record is frozen; {how}") from None
+
     @classmethod
     def from_dict(cls, values: object, source: str = "") -> Self:
         """Validates plain data.

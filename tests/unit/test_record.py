@@ -252,3 +252,11 @@ def test_misspelt(values, says):
     with pytest.raises(InputError) as refused:
         Scenario.from_dict(values)
     assert str(refused.value) == says
+
+
+def test_assignment():
+    """A record refuses a new value in one line that says what to do, and stays as it was."""
+    scenario = Scenario()
+    with pytest.raises(InputError, match=r"^laps: a record is frozen; replace\(laps=…\) returns one with .*$"):
+        scenario.laps = 3
+    assert scenario == Scenario()
