@@ -24,6 +24,12 @@ WITH_RECORDS = "run", "navigate", "identify", "view"
 SHORT_FLAGS = {"--robot": "--robot.path", "--sensing": "--sensing.tier", "--localise": "--sensing.localisation"}
 """Flags that stand for longer ones."""
 
+FLAGS_ELSEWHERE = {
+    "--tier": "--sensing.tier", "--wheels": "--robot.wheels", "--steering": "--robot.steering",
+    "--chassis": "--robot.chassis",
+}  # fmt: skip
+"""Flags of `check` and `tune`, and what they are called in the commands of `WITH_RECORDS`."""
+
 POSE_FLAGS = "--goal", "--start", "--initial-pose"
 """Flags whose values may be written as x,y,θ."""
 
@@ -189,6 +195,8 @@ def one_line(box: str, command: str) -> str:
             return f"{match[1]}: is no flag of{match[3]}, and those of mrctl {match[2]} stand before it"
         robot = match[1].startswith("--robot.") and command in ("check", "tune")
         instead = f"; the robot stands without a flag, as in mrctl {command} turtlebot" if robot else ""
+        if command in WITH_RECORDS and match[1] in FLAGS_ELSEWHERE:
+            instead = f"; did you mean {FLAGS_ELSEWHERE[match[1]]}?"
         return f"{match[1]}: is no flag of mrctl {match[2]}{instead}"
     if command in ("run", "view") and (match := re.match(r"Unrecognized options: (\S+\.toml)", text)):
         return f"{match[1]}: one scenario file may be given, in front of the reference"

@@ -81,7 +81,7 @@ def identify_with(arguments: list[str]) -> Callable[..., None]:
         """
         if file != CAR.path:
             if robot != CAR:
-                raise InputError("robot: give either a file or --robot")
+                raise InputError("robot: give either a file or --robot FILE, beside which --robot.wheels may stand")
             robot = RobotFile.from_dict({"path": file}, "robot")
         check_world(world, robot)
         from mrctl.experiments import identify as identification
