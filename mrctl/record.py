@@ -283,7 +283,8 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] == "union_tag_not_found":
         message = "must be a record, or a table of its fields, of which `kind` says what it is"
     if first["type"] == "union_tag_invalid":
-        message = f"no kind is called {first['ctx']['tag']!r}; there are {first['ctx']['expected_tags']}"
+        context = first.get("ctx", {})
+        message = f"no kind is called {context.get('tag')!r}; there are {context.get('expected_tags')}"
     if first["type"] == "tuple_type":  # a file has no tuples
         tables = (
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""
