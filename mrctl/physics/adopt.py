@@ -351,6 +351,9 @@ class _Adoption:
         coupled = [e for e in spec.equalities if {e.name1, e.name2} & {*self.steered, *self.wheels}]
         for element in [*spec.sensors, *spec.keys, *spec.pairs, *spec.excludes, *steering, *coupled]:
             spec.delete(element)
+        if spec.compiler.inertiafromgeom != 2 or spec.compiler.settotalmass > 0:  # the world's compiler has neither
+            for body in spec.bodies[1:]:
+                self._state_inertia(body)
         spec.compiler.inertiafromgeom = 2  # auto: keeps the explicit inertials, such as that of the moved chassis
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
@@ -386,16 +389,21 @@ class _Adoption:
             for other in chassis.frames:
                 if other.frame is None and other != frame:
                     other.set_frame(frame)
-            chassis.ipos = shift + turned @ body.ipos
+            self._state_inertia(chassis)
             inertial = np.zeros(4)
             mujoco.mju_mulQuat(inertial, quat, body.iquat)
-            chassis.iquat, chassis.mass, chassis.inertia = inertial, body.mass[0], body.inertia
-            chassis.ialt.type, chassis.fullinertia[0] = mujoco.mjtOrientation.mjORIENTATION_QUAT, np.nan
-            chassis.explicitinertial = True
+            chassis.ipos, chassis.iquat = shift + turned @ body.ipos, inertial
         chassis.pos, chassis.quat = (0.0, 0.0, self.radius), (1.0, 0.0, 0.0, 0.0)
         chassis.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         for joint in list(chassis.joints):
             self.spec.delete(joint)
+
+    def _state_inertia(self, body: Any) -> None:  # noqa: ANN401
+        """Writes the mass and the inertia that a body of the file has after compilation into the body itself."""
+        own = self.model.body(body.name)
+        body.mass, body.ipos, body.iquat, body.inertia = own.mass[0], own.ipos, own.iquat, own.inertia
+        body.ialt.type, body.fullinertia[0] = mujoco.mjtOrientation.mjORIENTATION_QUAT, np.nan
+        body.explicitinertial = True
 
     def _rotation(self) -> Array:
         """Returns the rotation from the file's world to the chassis' new frame, `(3, 3)`."""

@@ -126,6 +126,29 @@ def test_the_same_robot(file, name):
     assert v > 0.2 and omega > 0.05  # ahead, and to the left
 
 
+STATED = '<inertial pos="0.02 0 0" mass="3" diaginertia="0.02 0.03 0.02"/>'
+WEIGHED = DIFF.replace("<freejoint/>", "<freejoint/>" + STATED).replace('loss="0.1"/>', 'loss="0.1"/>' + STATED)
+MAST = '<body pos="0 0 0.2"><geom type="box" size="0.02 0.02 0.1"/></body>'
+
+
+@pytest.mark.parametrize("setting", ['inertiafromgeom="true"', 'inertiafromgeom="false"', 'settotalmass="30"', ""])
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+def test_mass_by_mujoco(file, setting):
+    """Mass, centre of mass and yaw inertia are those that MuJoCo gives the file, whatever its compiler counts."""
+    text = document(WEIGHED + MAST, MOTORS, compiler=f'angle="degree" {setting}')
+    own = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(own)
+    mujoco.mj_forward(own, data)
+    centre, inertia = data.subtree_com[1], 0.0
+    for body in range(1, own.nbody):
+        turned, off = data.ximat[body].reshape(3, 3)[2] ** 2, (data.xipos[body] - centre)[:2]
+        inertia += turned @ own.body_inertia[body] + own.body_mass[body] * off @ off
+    robot, _ = read(file(text))
+    expected = own.body_subtreemass[1], inertia, centre[0], centre[2]
+    found = robot.mass, robot.yaw_inertia, robot.com_offset, robot.com_height
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
 def drive(model, robot, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
     """Returns the readings of a robot that starts at the origin, after some seconds of constant voltages in V."""
     plant = build([model], robot, 5)
