@@ -103,8 +103,13 @@ class _Adoption:
         return [self._hinge(name, "wheels") for name in joints]
 
     def _steered(self, names: Sequence[str]) -> list[str]:
-        """Returns the joints of the steered wheels, at most two: those named, or the upright ones with an actuator."""
+        """Returns the joints of the steered wheels, at most two: those named, or the upright ones that are moved.
+
+        A joint is moved by an actuator of its own, or by an equality that couples it to a joint with an actuator.
+        """
         moved = {a.target for a in self.spec.actuators if self._is_hinge(a)}
+        couplings = [{e.name1, e.name2} for e in self.spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]
+        moved = moved.union(*(coupling for coupling in couplings if coupling & moved))
         upright = [name for name in self._hinges() if abs(self._axis(name)[2]) > 0.9 and name in moved]
         joints = list(names) or upright
         if len(joints) > 2 or len(set(joints)) < len(joints):

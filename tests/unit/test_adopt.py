@@ -193,6 +193,17 @@ def test_steered(file, body):
         assert 1 / np.tan(right) - 1 / np.tan(left) == pytest.approx(0.4 / 0.5, rel=2e-3) and left > phi > right
 
 
+def test_linkage_with_one_servo(file):
+    """Of two steered wheels that an equality couples, one servo steers both."""
+    couple = '<equality><joint joint1="s2" joint2="s1"/></equality>'
+    coupled, model = read(file(document(CAR, MOTORS + SERVO.format("s1"), extra=couple)))
+    own, _ = read(file(document(CAR, MOTORS + SERVO.format("s1") + SERVO.format("s2"))))
+    assert fronts(model) == ["front_left", "front_right"]
+    assert coupled.steering_stiffness == pytest.approx(8) and own.steering_stiffness == pytest.approx(16)
+    same = {"steering_stiffness": 0, "steering_damping": 0, "fork_inertia": 0}  # the rack's inertia follows the servo's
+    assert coupled.replace(**same) == own.replace(**same)
+
+
 def test_front_rates(file):
     """Steered wheels roll at rates proportional to their distances from the turning point."""
     robot, model = read(file(document(CAR, MOTORS + SERVO.format("s1") + SERVO.format("s2"))))
