@@ -294,12 +294,29 @@ def _check_elements(model: mujoco.MjModel, steering: Steering) -> None:
         if model.numeric(name).data.shape != (count,):
             raise InputError(f"numeric {name} needs {count} value{'s' * (count > 1)}")
     for name in MOTORS:
-        if model.actuator(name).gaintype != mujoco.mjtGain.mjGAIN_DCMOTOR:
-            raise InputError(f"actuator {name} must be a <dcmotor>")
+        _check_motor(model, name)
     if required and model.actuator_ctrlnum[model.actuator("steering").id] != 2:
         raise InputError("actuator steering must be a <pid> with position and velocity inputs")
     if not left_tyre_pairs(model):
         raise InputError("no contact pair between the wheels and a floor")
+
+
+def _check_motor(model: mujoco.MjModel, name: str) -> None:
+    """Refuses a motor whose command is no voltage, or whose current does not follow from voltage and speed.
+
+    Raises:
+        InputError: The actuator is no such motor; the message says why.
+    """
+    motor = model.actuator(name)
+    if motor.gaintype != mujoco.mjtGain.mjGAIN_DCMOTOR:
+        raise InputError(f"actuator {name} must be a <dcmotor>")
+    if int(model.actuator_ctrlspec[motor.id]) != mujoco.mjtCtrlInput.mjINPUT_VOLTAGE:
+        raise InputError(f"actuator {name} has another input than the voltage, which mrctl commands; leave it out")
+    if model.actuator_actnum[motor.id] > (motor.dynprm[0] > 0):  # more states than the current in an inductance
+        raise InputError(f"actuator {name} has thermal or lugre, which equation (3) leaves out; leave them out")
+    low, high = model.actuator_ctrlrange[model.actuator_ctrladr[motor.id]]
+    if low != -high:
+        raise InputError(f"actuator {name} has the ctrlrange {low:g} to {high:g} V; it must be -U to U, U the supply")
 
 
 def _rearrange(model: mujoco.MjModel, robot: Robot, steering: Steering) -> None:

@@ -351,12 +351,16 @@ def test_hull(file):
 
 
 PLAIN = '<velocity name="drive" joint="a"/>' + MOTOR.format("b", 30, "")
+WARM = 'inductance="1e-4 0" thermal="1 10 20 20 0.004 0.1"'
 TRIPLE = MOTORS + MOTOR.format("c", 30, "")
 ERRORS = {
     "no motors": (document(DIFF, ""), {}, ("wheels", "dcmotor", "'a', 'b'")),
     "three motors": (document(TRICYCLE, TRIPLE + SERVO.format("s1")), {}, ("wheels", "3 joints")),
     "another motor": (document(DIFF, PLAIN), {"wheels": ("a", "b")}, ("motor", "'a'", "'drive'", "<dcmotor joint=")),
     "no supply": (document(DIFF, MOTORS.replace('ctrlrange="-12 12"', "")), {}, ("motor", "ctrlrange")),
+    "no volts": (document(DIFF, MOTORS.replace("ctrlrange", 'input="vel" ctrlrange')), {}, ("motor_left", "voltage")),
+    "warm": (document(DIFF, MOTORS.replace("ctrlrange", f"{WARM} ctrlrange")), {}, ("motor_left", "thermal")),
+    "one-sided": (document(DIFF, MOTORS.replace("-12 12", "0 12")), {}, ("motor_left", "ctrlrange 0 to 12 V")),
     "no such wheel": (document(DIFF, MOTORS), {"wheels": ("a", "z")}, ("wheels", "'z'", "'a', 'b'")),
     "wheel named twice": (document(DIFF, MOTORS), {"wheels": ("a", "a")}, ("wheels", "'a', 'a'")),
     "wheel named three times": (document(DIFF, MOTORS), {"wheels": ("a", "b", "a")}, ("wheels", "'a', 'b', 'a'")),
