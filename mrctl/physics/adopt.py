@@ -151,12 +151,19 @@ class _Adoption:
         return ahead, np.cross(UP, ahead)
 
     def _wheel(self, joint: str) -> Wheel:
-        """Describes a wheel, whose radius and friction are those of the lowest geom of its body."""
+        """Describes a wheel, whose radius and friction are those of the lowest geom of its body.
+
+        Geoms that collide are preferred to those that do not.
+        """
         body = self._lineage(joint)[0]
         geoms = [g for g in range(self.model.ngeom) if self.model.geom_bodyid[g] == self.model.body(body).id]
         if not geoms:
             raise InputError(f"wheels: body {body!r} of joint {joint!r} has no geom to roll on")
-        return self._contact(min(geoms, key=self._bottom), body, joint)
+        return self._contact(min(self._colliding(geoms) or geoms, key=self._bottom), body, joint)
+
+    def _colliding(self, geoms: Iterable[int]) -> list[int]:
+        """Returns those of some geoms that collide with anything."""
+        return [g for g in geoms if self.model.geom_contype[g] or self.model.geom_conaffinity[g]]
 
     def _steered_wheel(self, steering: str) -> Wheel:
         """Describes the wheel that rolls below a steered joint."""
@@ -181,8 +188,7 @@ class _Adoption:
             and self._bottom(g) - floor < FLOOR_TOLERANCE * self.radius
         ]  # fmt: skip
         casters: list[Wheel] = []
-        colliding = [g for g in low if self.model.geom_contype[g] or self.model.geom_conaffinity[g]]
-        for g in colliding or low:
+        for g in self._colliding(low) or low:
             body = self.model.body(self.model.geom_bodyid[g])
             centre = self.data.geom_xpos[g]
             if all(np.hypot(*(centre - other.centre)[:2]) > FLOOR_TOLERANCE * self.radius for other in casters):

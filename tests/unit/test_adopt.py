@@ -193,6 +193,15 @@ def test_steered(file, body):
         assert 1 / np.tan(right) - 1 / np.tan(left) == pytest.approx(0.4 / 0.5, rel=2e-3) and left > phi > right
 
 
+@pytest.mark.parametrize("radius", [0.1, 0.104])
+def test_look_of_a_wheel(file, radius):
+    """Radius and friction of a wheel are those of the geom that collides, not those of one for the eye before it."""
+    look = f'<geom type="cylinder" size="{radius} 0.02" euler="90 0 0" mass="0" contype="0" conaffinity="0"/>'
+    dressed = re.sub('(<joint name="[ab]".*>)', r"\1" + look, DIFF)
+    assert dressed.count("contype") == 2
+    assert read(file(document(dressed, MOTORS)))[0] == read(file(document(DIFF, MOTORS)))[0]
+
+
 def test_linkage_with_one_servo(file):
     """Of two steered wheels that an equality couples, one servo steers both."""
     couple = '<equality><joint joint1="s2" joint2="s1"/></equality>'
