@@ -79,8 +79,9 @@ class _Adoption:
         wheels, steered = self._driven(robot.wheels), self._steered(robot.steering)
         self.chassis = self._carrier(robot.chassis, wheels)
         self.ahead, self.left = self._directions(wheels, steered)
-        self.origin = np.mean([self.data.joint(name).xanchor for name in wheels], axis=0)
-        self.wheels = sorted(wheels, key=self._side)
+        places = {name: self._on_axle(name) for name in wheels}
+        self.origin = np.mean([*places.values()], axis=0)
+        self.wheels = sorted(wheels, key=lambda name: -float((places[name] - self.origin) @ self.left))
         self.steered = sorted(steered, key=self._side)
         self.rear = [self._wheel(name) for name in self.wheels]
         self.radius = float(np.mean([wheel.radius for wheel in self.rear]))
@@ -160,6 +161,11 @@ class _Adoption:
         if not geoms:
             raise InputError(f"wheels: body {body!r} of joint {joint!r} has no geom to roll on")
         return self._contact(min(self._colliding(geoms) or geoms, key=self._bottom), body, joint)
+
+    def _on_axle(self, joint: str) -> Array:
+        """Returns the place on a wheel's axle that is nearest to its centre, in the file's world in m, `(3,)`."""
+        anchor, axis = self.data.joint(joint).xanchor, self._axis(joint)
+        return anchor + axis * ((self._wheel(joint).centre - anchor) @ axis)
 
     def _colliding(self, geoms: Iterable[int]) -> list[int]:
         """Returns those of some geoms that collide with anything."""

@@ -106,6 +106,12 @@ VARIANTS = {
         'pos="0 0 -0.3" euler="0 0 -30"'),
     "radian": document(
         DIFF.replace('euler="90 0 0"', 'euler="1.5707963267949 0 0"'), MOTORS, compiler='angle="radian"'),
+    "joints in the middle": document(
+        re.sub('<body pos="(0 -?0.2 0)">(.*?)euler', r'<body>\2pos="\1" euler', DIFF, flags=re.DOTALL),
+        MOTOR.format("b", 30, "") + MOTOR.format("a", 30, "")),
+    "a joint beside its wheel": document(
+        DIFF.replace('pos="0 0.2 0"', 'pos="0 0.1 0"').replace('euler="90 0 0"', 'euler="90 0 0" pos="0 0.1 0"', 1),
+        MOTORS),
     "welded to the world": document(DIFF.removeprefix("<freejoint/>"), MOTORS),
     "names of ours": document(DIFF, MOTORS).replace('"ball"', '"chassis"'),
     "sensors and keys": document(
