@@ -463,7 +463,8 @@ class _Adoption:
     def _add_steering(self, spec: mujoco.MjSpec) -> None:
         """Adds a servo with set-points of angle and rate, and the linkage of two steered wheels."""
         servos = [k for k in range(len(self.model.actuator_trntype)) if self._turns_steering(k)]
-        kp, kv = (sum(-self.model.actuator_biasprm[k, i] for k in servos) for i in (1, 2))
+        gears = self.model.actuator_gear[:, 0]
+        kp, kv = (sum(-self.model.actuator_biasprm[k, i] * gears[k] ** 2 for k in servos) for i in (1, 2))
         if not kp > 0:
             raise InputError(f"steering: {_listed(self.steered)} needs a <position> or <pid> actuator with a kp")
         ranges = [self.model.joint(name).range for name in self.steered]
@@ -478,6 +479,9 @@ class _Adoption:
         joint.range = np.array([-limit, limit]) * (180 / np.pi if self._in_degrees(len(anchors)) else 1.0)
         servo = spec.add_actuator(name="steering", target="steering", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_pid(kp=kp, kv=kv)
+        if self.model.actuator_forcelimited[servos].all():
+            torques = np.abs(gears[servos, None] * self.model.actuator_forcerange[servos]).min(axis=1)
+            servo.forcelimited, servo.forcerange = 1, torques.sum() * np.array([-1.0, 1.0])
         spec.add_text(name=RIGID, data="the wheels go where the servo says")
 
     def _add_linkage(self, spec: mujoco.MjSpec, anchors: Sequence[Array], limit: float, kv: float) -> float:

@@ -208,6 +208,24 @@ def test_look_of_a_wheel(file, radius):
     assert read(file(document(dressed, MOTORS)))[0] == read(file(document(DIFF, MOTORS)))[0]
 
 
+def test_geared_servo(file):
+    """A servo behind a gear is as stiff, and as strong, at the steered joint as in its own file."""
+    text = document(TRICYCLE, MOTORS + SERVO.format("s1").replace("/>", ' gear="-3" forcerange="-0.5 0.5"/>'))
+    robot, model = read(file(text))
+    own = mujoco.MjModel.from_xml_string(text)
+    data, dof = mujoco.MjData(own), own.joint("s1").dofadr[0]
+    data.qpos[own.joint("s1").qposadr[0]] = angle = 0.01
+    mujoco.mj_forward(own, data)
+    assert robot.steering_stiffness == pytest.approx(-data.qfrc_actuator[dof] / angle)
+    data.ctrl[own.actuator_ctrladr[2]] = 10.0
+    mujoco.mj_forward(own, data)
+    strongest = abs(data.qfrc_actuator[dof])
+    data = mujoco.MjData(model)
+    data.ctrl[model.actuator_ctrladr[model.actuator("steering").id]] = 10.0
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_actuator[model.joint("steering").dofadr[0]] == pytest.approx(strongest)
+
+
 def test_linkage_with_one_servo(file):
     """Of two steered wheels that an equality couples, one servo steers both."""
     couple = '<equality><joint joint1="s2" joint2="s1"/></equality>'
