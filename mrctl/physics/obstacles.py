@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Array
 from mrctl.physics.bounds import check_bounds, compiling
-from mrctl.physics.elements import COLLISION
+from mrctl.physics.elements import COLLISION, bottom
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
 from mrctl.theory.obstacles import GROUND_HEIGHT, OVERHEAD_HEIGHT, Box, Disc, Obstacles, Polygon
@@ -197,8 +197,8 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
         corners = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
         points = corners @ frame.T + place
     else:
-        half = size[[0, 0, 1]] if kind == shape.mjGEOM_CYLINDER else size
-        points = place + np.abs(frame[2]) @ half * np.array([[0, 0, -1.0], [0, 0, 1]])
+        half = abs(place[2] - bottom(model, data, geom))  # infinite for a shape that is refused below
+        points = place + half * np.array([[0, 0, -1.0], [0, 0, 1]])
     low, high = points[:, 2].min(), points[:, 2].max()
     if high <= GROUND_HEIGHT:
         return None

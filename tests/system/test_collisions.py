@@ -222,6 +222,14 @@ def test_mjcf_lintel(tmp_path):
             read_mjcf(tmp_path / "post.xml")
 
 
+@pytest.mark.parametrize("post", ['type="sphere" size="0.3"', 'type="capsule" size="0.2 0.1" pos="1 0 -0.15"'])
+def test_mjcf_half_sunk(tmp_path, post):
+    """A sphere or capsule whose middle is in the ground is no floor, because it ends above 2 cm."""
+    (tmp_path / "post.xml").write_text(f"<mujoco><worldbody><geom {post}/></worldbody></mujoco>")
+    with pytest.raises(InputError, match="not an upright box or cylinder"):
+        read_mjcf(tmp_path / "post.xml")
+
+
 def test_mjcf(tmp_path):
     """Obstacles come back from MJCF as they were, with their courses; a floor is none."""
     (tmp_path / "a.xml").write_text(to_mjcf(MIXED))
