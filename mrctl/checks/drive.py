@@ -27,6 +27,7 @@ from mrctl.checks.open_loop import (
     towing,
 )
 from mrctl.physics.elements import REAR
+from mrctl.physics.readout import motor_parameters
 from mrctl.theory.dynamics import accelerations
 from mrctl.theory.kinematics import wheel_rates
 from mrctl.theory.perturbation import Perturbation
@@ -78,7 +79,7 @@ def top_speed(model: mujoco.MjModel, robot: Robot) -> Report:
     loss = high - fast / gain
     return [
         compare("no-load speed", gain * high, robot.velocity_gain * high, "m/s", relative=2e-3),
-        compare("voltage lost to friction", loss, loss_voltage(robot), "V", relative=1e-2),
+        compare("voltage lost to friction", loss, loss_voltage(robot), "V", relative=1e-2, absolute=1e-6 * high),
     ]
 
 
@@ -92,6 +93,7 @@ def stall(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     car = Car(model)
     car.control((robot.supply, robot.supply, 0, 0))
+    car.data.act[motor_parameters(model)[2]] = robot.supply / robot.resistance  # what flows once it does not change
     mujoco.mj_forward(model, car.data)
     shaft = [car.data.qfrc_actuator[model.joint(name).dofadr[0]] for name in REAR]
     report = [

@@ -1,6 +1,7 @@
 """The checks pass for the shipped robot and for variants of it, and its file holds the documented numbers."""
 
 import math
+import shutil
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from mrctl.checks.catalogue import CHECKS, Check
 from mrctl.checks.comparison import CheckFailed, Comparison, between, compare
+from mrctl.physics.files import models_folder
 from mrctl.physics.mjcf import clone, load
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
@@ -94,6 +96,17 @@ def test_other_robots(check, change):
     """Another robot, read from its own model, obeys the same laws: no check is tuned to the shipped one."""
     model = load(check.world, check.steering)
     change(model)
+    check.run(model, read_robot(model))
+
+
+@pytest.mark.parametrize("name", ["stall", "energy"])
+def test_inductance(tmp_path, name):
+    """The current of a winding follows within L/R, here 2 ms, which changes neither stall torque nor balance."""
+    folder = shutil.copytree(models_folder(), tmp_path / "models")
+    text = (folder / "car.xml").read_text()
+    (folder / "car.xml").write_text(text.replace('resistance="2.32"', 'resistance="2.32" inductance="4.64e-3 0"'))
+    (check,) = (check for check in CHECKS if check.name == name)
+    model = load(str(folder / "flat.xml"), check.steering)
     check.run(model, read_robot(model))
 
 
