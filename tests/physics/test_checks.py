@@ -99,6 +99,19 @@ def test_other_robots(check, change):
     check.run(model, read_robot(model))
 
 
+@pytest.mark.parametrize("name", ["hold_on_slope", "coast_down", "top_speed"])
+def test_no_losses(name):
+    """A robot without Coulomb losses has no voltage that they take; what measures their force does not suit it."""
+    (check,) = (check for check in CHECKS if check.name == name)
+    model = load(check.world, check.steering)
+    model.dof_frictionloss[:] = 0
+    model.numeric("no_load_current").data[:] = 0
+    if name == "top_speed":
+        assert check.unsuited(model) == "" and check.run(model, read_robot(model))
+    else:
+        assert check.unsuited(model) == "the robot has no Coulomb losses" and not check.unsuited(load())
+
+
 @pytest.mark.parametrize("name", ["stall", "energy"])
 def test_inductance(tmp_path, name):
     """The current of a winding follows within L/R, here 2 ms, which changes neither stall torque nor balance."""
