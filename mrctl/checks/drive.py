@@ -45,8 +45,9 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
     force, weight = holding_force(robot), robot.mass * GRAVITY
     steepest = _steepest(robot)
     slopes = [Perturbation(slope=-float(np.arcsin(ratio * force / weight))) for ratio in (0.5, steepest)]
+    fine = crisp(model, robot, np.inf)
     standing, rolling = (
-        Car(perturbed(model, slope)).drive(settling_time(robot), NO_CONTROL)["v"][-1] for slope in slopes
+        Car(perturbed(fine, slope)).drive(settling_time(robot), NO_CONTROL)["v"][-1] for slope in slopes
     )
     terminal = (steepest - 1) * force / braking(robot)
     tolerance = 2.5e-3 * steepest * force / braking(robot)
@@ -74,7 +75,8 @@ def top_speed(model: mujoco.MjModel, robot: Robot) -> Report:
     sink in by 0.05 % of the radius; that of the loss is 1 %, as it is a small difference of large numbers.
     """
     high, low = robot.supply, robot.supply / 2
-    fast, slow = (cruise(model, robot, u)[1]["v"][-1] for u in (high, low))
+    fine = crisp(model, robot, np.inf)
+    fast, slow = (cruise(fine, robot, u)[1]["v"][-1] for u in (high, low))
     gain = (fast - slow) / (high - low)
     loss = high - fast / gain
     return [
@@ -167,7 +169,7 @@ def coast_down(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     deceleration = holding_force(robot) / robot.effective_mass
     speed = robot.max_speed
-    log = Car(open_circuit(model), twist=(speed, 0)).drive(0.8 * speed / deceleration, NO_CONTROL)
+    log = Car(open_circuit(crisp(model, robot, np.inf)), twist=(speed, 0)).drive(0.8 * speed / deceleration, NO_CONTROL)
     moving = log.time > 0.1  # the tyres take up their load
     slope, start = np.polyfit(log.time[moving], log["v"][moving], 1)
     bend = np.abs(log["v"] - start - slope * log.time)[moving].max()
@@ -186,9 +188,10 @@ def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
     and of both terms. The tolerance is 2 % of the whole term: both are differences of voltage and back-EMF, which are
     ten times larger, and to which the sinking of the tyres adds 0.05 %.
     """
-    back, remaining = 0.5, 0.1  # m behind P, and the share of c that remains
+    back, remaining = min(0.5, robot.size), 0.1  # m behind P, and the share of c that remains
     ballast = robot.mass * robot.com_offset * (1 - remaining) / (back + remaining * robot.com_offset)
-    payload = Perturbation(payload=ballast, payload_x=-back, payload_z=robot.wheel_radius)
+    laden = {"payload": ballast, "payload_x": -back, "payload_z": robot.wheel_radius}
+    payload = Perturbation().model_copy(update=laden)  # whatever its mass
     changed = {"mass": robot.mass + ballast, "com_offset": remaining * robot.com_offset}
     loss = on_skid_robot(robot).drive_loss / robot.motor_gain
     drive = np.array([0.1, 0.5]) * robot.supply - loss
@@ -196,15 +199,15 @@ def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
     volts = loss + drive * min(1.0, np.sqrt(0.2 * robot.tyre_friction * GRAVITY / abs(v * omega)))
     report = []
     whole = robot.mass * robot.com_offset
-    laden = perturbed(model, payload), robot.model_copy(update=changed)
-    for name, car, true in (("", model, robot), (" with c/10", *laden)):
+    other = perturbed(model, payload), robot.model_copy(update=changed)
+    for name, car, true in (("", model, robot), (" with c/10", *other)):
         crispy = crisp(on_skid(car), true, min(true.velocity_time_constant, true.rotation_time_constant))
         start = Car(crispy, twist=(robot.velocity_gain * (volts.mean() - loss), 0))
         log = start.drive(2 * settling_time(true), (*volts, 0, 0))
         v, omega, sideways = log["v"][-1], log["omega"][-1], log["v_lateral"][-1]
         torques = true.motor_gain * (volts - true.back_emf * wheel_rates((v, omega), true))
-        loss = 2 * on_skid_robot(true).drive_loss
-        push = (loss - torques.sum()) / true.wheel_radius - true.mass * sideways * omega
+        friction = 2 * on_skid_robot(true).drive_loss
+        push = (friction - torques.sum()) / true.wheel_radius - true.mass * sideways * omega
         drag = true.half_track / true.wheel_radius * (torques[1] - torques[0])
         lever = true.mass * true.com_offset
         report += [

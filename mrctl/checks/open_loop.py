@@ -276,7 +276,8 @@ def crisp(model: mujoco.MjModel, robot: Robot, tau: float) -> mujoco.MjModel:
     """Returns a copy whose contacts and time step are as short against τ and the wheel radius as the default robot's.
 
     Slip grows with a contact's time constant, and the sinking of a tyre with its square: in such a copy both matter no
-    more than in the default robot, for which the tolerances are stated.
+    more than in the default robot, for which the tolerances are stated. At a constant speed only the radius matters,
+    and τ is infinite.
     """
     factor = min(1.0, tau / 0.18, np.sqrt(robot.wheel_radius / 0.098))
     model = clone(model)
@@ -296,8 +297,8 @@ def with_finer_step(model: mujoco.MjModel, halvings: int) -> mujoco.MjModel:
 def towing(model: mujoco.MjModel, damping: float) -> mujoco.MjModel:
     """Returns a copy that tows a load of `damping` N·s/m at P, on a rail that keeps it from turning and side-slip."""
     model = clone(model)
-    dof = model.joint("chassis").dofadr[0]
-    model.dof_damping[[dof, dof + 1, dof + 5]] = damping, 1e6, 1e6
+    dof, rail = model.joint("chassis").dofadr[0], max(1e6, 1e3 * damping)
+    model.dof_damping[[dof, dof + 1, dof + 5]] = damping, rail, rail
     return model
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mrctl.checks.catalogue import CHECKS, Check
 from mrctl.checks.comparison import CheckFailed, Comparison, between, compare
 from mrctl.physics.files import models_folder
-from mrctl.physics.mjcf import clone, load
+from mrctl.physics.mjcf import clone, load, load_robot
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
 from mrctl.theory.perturbation import Perturbation
@@ -96,6 +96,38 @@ def test_other_robots(check, change):
     """Another robot, read from its own model, obeys the same laws: no check is tuned to the shipped one."""
     model = load(check.world, check.steering)
     change(model)
+    check.run(model, read_robot(model))
+
+
+DRIVE = """<mujoco><worldbody><body name="base" pos="0 0 {r}"><freejoint/>
+  <geom type="box" size="{a} {b} {h}" pos="{c} 0 {h}" mass="{mass}"/>
+  <geom type="sphere" size="{ball}" pos="{front} 0 -{h}"/>
+  <body name="w1" pos="0 {y} 0"><joint name="left" axis="0 1 0" frictionloss="{loss}" solimpfriction=".99 .99"/>
+    <geom type="cylinder" size="{r} {w}" zaxis="0 1 0" mass="{wheel}"/></body>
+  <body name="w2" pos="0 -{y} 0"><joint name="right" axis="0 1 0" frictionloss="{loss}" solimpfriction=".99 .99"/>
+    <geom type="cylinder" size="{r} {w}" zaxis="0 1 0" mass="{wheel}"/></body>
+  </body></worldbody><actuator><dcmotor joint="left" {motor}/><dcmotor joint="right" {motor}/></actuator></mujoco>"""
+DRIVE_SIZES = {
+    "a": 0.15, "b": 0.08, "h": 0.03, "c": 0.06, "ball": 0.02, "front": 0.16, "y": 0.1, "r": 0.05, "w": 0.01,
+}  # fmt: skip
+MOTORS = {
+    "tiny": 'gear="20" motorconst="0.002 0.002" resistance="10" armature="1e-9" ctrlrange="-3 3"',
+    "truck": 'gear="40" motorconst="0.5 0.5" resistance="0.05" armature="0.05" ctrlrange="-96 96"',
+}
+SCALES = {"tiny": (0.2, 0.05, 2e-4), "truck": (10.0, 1500.0, 30.0)}  # size, mass in kg, frictionloss in N·m
+
+
+@pytest.mark.parametrize("name", ["hold_on_slope", "top_speed", "stall", "coast_down", "centre_of_mass"])
+@pytest.mark.parametrize("size", SCALES)
+def test_robots_of_any_size(tmp_path, size, name):
+    """A differential drive of 50 g on wheels of 1 cm, and one of 1.5 t on wheels of half a metre, obey equation (3)."""
+    scale, mass, loss = SCALES[size]
+    lengths = {key: scale * value for key, value in DRIVE_SIZES.items()}
+    (tmp_path / "robot.xml").write_text(
+        DRIVE.format(**lengths, mass=mass, wheel=mass / 15, loss=loss, motor=MOTORS[size])
+    )
+    (check,) = (check for check in CHECKS if check.name == name)
+    model = load(robot=load_robot(tmp_path / "robot.xml"))
     check.run(model, read_robot(model))
 
 
