@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import re
 import warnings
 from collections.abc import Sequence
 from functools import lru_cache
@@ -154,10 +155,32 @@ def _assembled(world: Path, robot: RobotFile) -> mujoco.MjSpec:
     keeps its servo and its steering arrangements. The robot of any other file is adopted.
     """
     if robot != CAR and robot == RobotFile(path=robot.path) and INCLUDED in world.read_text():
-        text = robot_path(robot).read_bytes()
-        if _has_names_of_car(mujoco.MjSpec.from_file(str(robot_path(robot)))):
-            return mujoco.MjSpec.from_file(str(world), include={f"{CAR.path}.xml": text})
+        own = mujoco.MjSpec.from_file(str(robot_path(robot)))
+        if _has_names_of_car(own):
+            return _in_place_of_car(world, robot_path(robot), own)
     return mujoco.MjSpec.from_file(str(world)) if robot == CAR else adopt.adopted(robot, world)
+
+
+def _in_place_of_car(world: Path, path: Path, own: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Returns a world with a robot's file, which is parsed already, in the place of `car.xml`.
+
+    MuJoCo would look beside the world for the files that the robot's file includes, and for its meshes and images.
+    """
+    texts, left = {f"{CAR.path}.xml": path.read_bytes()}, [path]
+    while left:
+        for name in re.findall(r'<include\s+file="([^"]+)"', left.pop().read_text()):
+            if (file := path.parent / name).is_file():
+                texts[name] = file.read_bytes()
+                left.append(file)
+    spec = mujoco.MjSpec.from_file(str(world), include=texts)
+    assets = (("mesh", own.meshes, own.meshdir), ("texture", own.textures, own.texturedir))
+    for kind, asset, folder in ((kind, asset, folder) for kind, found, folder in assets for asset in found):
+        file = next((f for f in (path.parent / folder / asset.file, path.parent / asset.file) if f.is_file()), None)
+        if file:
+            getattr(spec, kind)(asset.name).file = str(file.resolve())
+    if (own.meshdir, own.texturedir) == (spec.meshdir, spec.texturedir):  # not those of the world's own files
+        spec.meshdir = spec.texturedir = ""
+    return spec
 
 
 def _has_names_of_car(spec: mujoco.MjSpec) -> bool:

@@ -259,6 +259,23 @@ def test_copy_of_the_default_robot(file):
     assert heavy.mass == pytest.approx(own.mass + 10) and heavy.steering_stiffness == own.steering_stiffness > 0
 
 
+@pytest.mark.parametrize("world", ["flat", "rough"])
+def test_copy_with_files_of_its_own(tmp_path, world):
+    """What a copy of the default robot's file includes, and its meshes, lie beside it, and not beside the world."""
+    text = (models_folder() / "car.xml").read_text()
+    looks = text[text.index("<asset>") : text.index("</asset>") + len("</asset>")]
+    (tmp_path / "meshes").mkdir()
+    places = [f"v {x} {y} {z}" for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
+    (tmp_path / "meshes" / "deck.obj").write_text("\n".join([*places, "f 1 2 3", "f 6 5 8", "f 4 7 2"]))
+    meshes = looks.replace("<asset>", '<asset><mesh file="deck.obj"/>')
+    (tmp_path / "looks.xml").write_text(f"<mujoco>{meshes}</mujoco>")
+    text = text.replace(looks, '<include file="looks.xml"/>').replace("<compiler ", '<compiler meshdir="meshes" ')
+    text = text.replace('<site name="imu"', '<geom type="mesh" mesh="deck" pos="0 0 0.1"/><site name="imu"')
+    (tmp_path / "mine.xml").write_text(text)
+    model = mjcf.load(world, robot=mrctl.load_robot(tmp_path / "mine.xml"))
+    assert model.nmesh == 1 and read_robot(model) == read_robot(mjcf.load(world))
+
+
 @pytest.mark.parametrize(("name", "steering"), [("turtlebot", "caster"), ("racecar", "rigid"), ("car", "compliant")])
 def test_robot_brings_its_steering(name, steering):
     """A scenario that names a robot and no steering drives with that robot's, and its result says which."""
