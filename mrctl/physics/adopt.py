@@ -387,6 +387,7 @@ class _Adoption:
             if joint.type == HINGE and self._axis(name) @ (UP if name in self.steered else self.left) < 0:
                 joint.axis = -np.array(joint.axis)
                 joint.range = -np.array(joint.range)[::-1]
+                joint.ref, joint.springref = -joint.ref, -joint.springref
         for name in self.motors:
             motor = self.spec.actuator(name)
             motor.gear = np.abs(motor.gear)

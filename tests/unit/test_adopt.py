@@ -208,6 +208,18 @@ def test_look_of_a_wheel(file, radius):
     assert read(file(document(dressed, MOTORS)))[0] == read(file(document(DIFF, MOTORS)))[0]
 
 
+def test_mirrored_steering(file):
+    """A steering axis that points down, with mirrored range, zero and spring, is the same one: the paths are equal."""
+    up = 'axis="0 0 1" range="-20 30" ref="10" springref="4" stiffness="1"'
+    down = 'axis="0 0 -1" range="-30 20" ref="-10" springref="-4" stiffness="1"'
+    poses = []
+    for joint in (up, down):
+        body = TRICYCLE.replace('axis="0 0 1" range="-30 30"', joint)
+        robot, model = read(file(document(body, MOTORS + SERVO.format("s1"))))
+        poses.append(drive(model, robot, (5.0, 5.0))["pose"])
+    np.testing.assert_allclose(*poses, atol=1e-9)
+
+
 def test_geared_servo(file):
     """A servo behind a gear is as stiff, and as strong, at the steered joint as in its own file."""
     text = document(TRICYCLE, MOTORS + SERVO.format("s1").replace("/>", ' gear="-3" forcerange="-0.5 0.5"/>'))
