@@ -284,16 +284,19 @@ def _gear(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 def _drag(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     joints = [j for j in ("chassis", *rolling_wheels(model)) if model.joint(j).damping.any()]
+    motors = [motor for motor in MOTORS if model.actuator_damping[model.actuator(motor).id]]
     air = [field for field in ("density", "viscosity") if getattr(model.opt, field)]
-    if not joints and not air:
+    if not (joints or motors or air):
         return None
 
     def repair(faulty: mujoco.MjModel) -> None:
         for joint in joints:
             faulty.joint(joint).damping[:] = 0
+        faulty.actuator_damping[[faulty.actuator(motor).id for motor in motors]] = 0
         faulty.opt.density = faulty.opt.viscosity = 0
 
     clauses = [f"joint {j} has damping {model.joint(j).damping.max():g}" for j in joints]
+    clauses += [f"{m} has damping {model.actuator_damping[model.actuator(m).id]:g}" for m in motors]
     clauses += [f"the air has {field} {getattr(model.opt, field):g}" for field in air]
     advice = "in equation (3) only back-EMF brakes with speed, so write losses as frictionloss"
     return Suspect("drag", f"{', '.join(clauses)}; {advice}", repair)
