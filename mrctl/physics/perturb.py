@@ -100,9 +100,10 @@ def _perturb_bodies(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbat
     model.body_inertia[:] = nominal.body_inertia
     model.body_mass[bodies] *= p.mass_factor
     model.body_inertia[bodies] *= p.mass_factor
-    model.body_inertia[chassis, _upright_axis(nominal, chassis)] *= p.inertia_factor
     model.body_ipos[chassis] = nominal.body_ipos[chassis]
     model.body_iquat[chassis] = nominal.body_iquat[chassis]
+    if p.inertia_factor != 1:
+        _scale_yaw_inertia(model, chassis, p.inertia_factor)
     if p.payload > 0:
         position = np.array([p.payload_x, p.payload_y, p.payload_z - wheel_radius])
         _add_point_mass(model, chassis, p.payload, position)
@@ -177,11 +178,37 @@ def limit_current(nominal: mujoco.MjModel, model: mujoco.MjModel, limit: float) 
     model.actuator_forcerange[motors] = np.array([-torque, torque]).T
 
 
-def _upright_axis(model: mujoco.MjModel, body: int) -> int:
-    """Returns the index of the principal axis of a body that is nearest to the z axis of its frame."""
+def _scale_yaw_inertia(model: mujoco.MjModel, body: int, factor: float) -> None:
+    """Multiplies the inertia of a body about the z axis of its frame, and what couples it to others by the root.
+
+    The tensor so stays positive definite.
+    """
+    frame = _principal_axes(model, body)
+    axis = int(np.argmax(np.abs(frame[2])))
+    if abs(frame[2, axis]) > 1 - 1e-9:
+        model.body_inertia[body, axis] *= factor
+        return
+    tensor = frame * model.body_inertia[body] @ frame.T
+    tensor[2] *= np.sqrt(factor)
+    tensor[:, 2] *= np.sqrt(factor)
+    _write_inertia(model, body, tensor)
+
+
+def _principal_axes(model: mujoco.MjModel, body: int) -> Array:
+    """Returns the principal axes of a body in its frame, one in each column, `(3, 3)`."""
     frame = np.zeros(9)
     mujoco.mju_quat2Mat(frame, model.body_iquat[body])
-    return int(np.argmax(np.abs(frame[6:])))
+    return frame.reshape(3, 3)
+
+
+def _write_inertia(model: mujoco.MjModel, body: int, tensor: Array) -> None:
+    """Writes an inertia tensor about the centre of mass in the body's frame, `(3, 3)`, as MuJoCo stores it."""
+    principal, axes = np.linalg.eigh(tensor)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, axes.ravel())
+    model.body_inertia[body], model.body_iquat[body] = principal, quat
 
 
 def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: Array) -> None:
@@ -190,9 +217,7 @@ def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: Arr
     The parallel-axis theorem gives the tensor about the new centre of mass, whose principal axes MuJoCo stores.
     """
     own = model.body_mass[body]
-    frame = np.zeros(9)
-    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
-    frame = frame.reshape(3, 3)
+    frame = _principal_axes(model, body)
     own_centre = model.body_ipos[body].copy()
     total = own + mass
     centre = (own * own_centre + mass * position) / total
@@ -200,15 +225,9 @@ def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: Arr
     for m, point in ((own, own_centre), (mass, position)):
         d = point - centre
         tensor = tensor + m * (d @ d * np.eye(3) - np.outer(d, d))
-    principal, axes = np.linalg.eigh(tensor)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, axes.ravel())
     model.body_mass[body] = total
     model.body_ipos[body] = centre
-    model.body_inertia[body] = principal
-    model.body_iquat[body] = quat
+    _write_inertia(model, body, tensor)
 
 
 def fields(model: mujoco.MjModel) -> dict[str, NDArray]:

@@ -174,6 +174,21 @@ def test_rolling_follows_load():
     assert left - right == pytest.approx(2 * share * BASE.rolling_coefficient * BASE.wheel_radius)
 
 
+@pytest.mark.parametrize("factor", [0.05, 1.5])
+def test_inertia_factor_of_tilted_axes(factor):
+    """The factor scales the chassis' yaw inertia itself, also where its principal axes are tilted."""
+    nominal = mjcf.load()
+    chassis, tilt = nominal.body("chassis").id, 0.5
+    mujoco.mju_axisAngle2Quat(nominal.body_iquat[chassis], np.array([0.0, 1.0, 0.0]), tilt)
+    mujoco.mj_setConst(nominal, mujoco.MjData(nominal))
+    own = nominal.body_inertia[chassis] @ np.array([np.sin(tilt), 0, np.cos(tilt)]) ** 2
+    model = mjcf.clone(nominal)
+    perturb(nominal, model, Perturbation(inertia_factor=factor))
+    found = read_robot(model).yaw_inertia - read_robot(nominal).yaw_inertia
+    assert found == pytest.approx((factor - 1) * own, rel=1e-9)
+    assert model.body_inertia[chassis].min() > 0
+
+
 def test_inertia_factor():
     """The inertia factor scales the chassis' own 0.4275 kg·m² about the vertical and nothing else."""
     robot = read_robot(perturbed(inertia_factor=1.5))
