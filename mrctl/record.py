@@ -284,7 +284,7 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
         message = "must be a record, or a table of its fields, of which `kind` says what it is"
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})
-        message = f"no kind is called {context.get('tag')!r}; there are {context.get('expected_tags')}"
+        message = f"'kind' is {context.get('tag')!r}, which is none of {context.get('expected_tags')}"
     if first["type"] == "tuple_type":  # a file has no tuples
         tables = (
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""

@@ -242,7 +242,7 @@ def test_names_in_the_place_of_records():
         ),
         (
             {"reference": {"kind": "circel"}},
-            "reference: no kind is called 'circel'; there are 'line', 'circle', 'lemniscate', 'lane_change', "
+            "reference: 'kind' is 'circel', which is none of 'line', 'circle', 'lemniscate', 'lane_change', "
             "'rounded_square', 'stop_and_go', 'waypoints'",
         ),
     ],
