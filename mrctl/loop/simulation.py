@@ -8,7 +8,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Unpack
+from typing import Any, NoReturn, Unpack
 
 import numpy as np
 import xarray as xr
@@ -397,6 +397,14 @@ class Simulation:
             self.courses = self.courses.extended(scenarios)
         self.scenarios = scenarios
         self.events.add(event)
+
+    def __reduce__(self) -> NoReturn:
+        """Refuses to be copied or pickled: laws hold addresses of its arrays, so that a copy would move the original.
+
+        Raises:
+            TypeError: Always.
+        """
+        raise TypeError("simulation: cannot be copied or pickled; another one of its scenarios gives the same bits")
 
     def step(self) -> None:
         """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""

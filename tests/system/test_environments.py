@@ -1,6 +1,8 @@
 """Environments: what their own makers' checkers ask for, and the very physics of `simulate`, bit for bit."""
 
+import copy
 import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -516,6 +518,23 @@ def test_seeds_of_another_number():
     vector = TrackingVectorEnv(3, SHORT)
     with pytest.raises(InputError, match="^seed: 2 seeds for 3 robots"):
         vector.reset(seed=[1, 2])
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_no_copy(copied):
+    """A copy would share the memory of the laws: it is refused, and the robot drives on with the same bits."""
+    for env in (TrackingEnv(SHORT), TrackingVectorEnv(2, SHORT), SUITE["residual"](SHORT)):
+        with pytest.raises(TypeError, match="^simulation: cannot be copied or pickled"):
+            copied(env)
+    env = TrackingEnv(EXACT)
+    env.reset(seed=3)
+    bits = expected(EXACT, 3)
+    for tick in range(20):
+        env.step(np.zeros(2))
+        if tick == 10:
+            with pytest.raises(TypeError):
+                copied(env)
+        np.testing.assert_array_equal(last(env.episodes)[PRESENT], bits[tick, PRESENT])
 
 
 def test_tick_of_a_failure():
