@@ -20,7 +20,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import RECOVERED_RATIO, REFERENCES, SLOW, Choice, Choices, Outcome
-from mrctl.experiments.suite_tables import NO_CLAIM, titled, verdict
+from mrctl.experiments.suite_tables import NO_CLAIM, times, titled, verdict
 from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
@@ -235,7 +235,7 @@ def recoveries(outcome: Outcome) -> str:
             after, back = (error[name]["value"] for name in ("after_one_lap", "return_after_one_lap"))
             mean = f"{number(1e3 * error['during']['value'])}: " if error["during"]["samples"] else ""
             lost = f", {row['failed']} failed" if row["failed"] else ""
-            text = f"{mean}{number(after)}×, {number(back)}×{lost}"
+            text = f"{mean}{times(after)}, {times(back)}{lost}"
             bold = error["recovered_within_one_lap"] == 1
             cells.setdefault(case, {})[row["feedforward"]] = Cell(text, after / RECOVERED_RATIO, bold)
     return _coloured("recoveries", cells)

@@ -222,7 +222,8 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
     """Finds, for each case and column of `LEADING`, the feedforward with the least mean, and those level with it.
 
     A feedforward is level if the best does not beat it with 95 % confidence in the same runs. One with a failed run is
-    left out, unless all have one; so are `REFERENCES`, which know the plant. Where all are level, it is a tie.
+    left out; where all have one, the best is among those with the fewest. `REFERENCES`, which know the plant, are left
+    out too. Where all are level, it is a tie.
     """
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
@@ -230,7 +231,9 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
         fine = [name for name, row in own.items() if not row["failed"]] or list(own)
         cells = []
         for metric, window in LEADING.values():
-            best, *others = sorted(fine, key=lambda name: float(_window(own[name][metric], window)["value"]))
+            best, *others = sorted(
+                fine, key=lambda name: (own[name]["failed"], _window(own[name][metric], window)["value"])
+            )
             level = [one for one in others if verdict(own[best], one, metric, window) >= 0]
             names = (titled(name) for name in (best, *level))
             cells.append("tie" if others and len(level) == len(others) else ", ".join(names))
@@ -256,14 +259,19 @@ def recovery(rows: Sequence[Row]) -> pd.DataFrame:
     for row in rows:
         error = row["position_rmse"]
         names = ("in_first_lap", "after_one_lap", "return_first_lap", "return_after_one_lap")
-        first, later, back, settled = (f"{number(error[name]['value'])}×" for name in names)
+        first, later, back, settled = (times(error[name]["value"]) for name in names)
         within = " / ".join(f"{100 * row[m]['recovered_within_one_lap']:.0f} %" for m in COLUMNS)
         later, settled = (
-            f"{text}; {number(error[f'{name}_worst'])}×" for text, name in ((later, names[1]), (settled, names[3]))
+            f"{text}; {times(error[f'{name}_worst'])}" for text, name in ((later, names[1]), (settled, names[3]))
         )
         cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
-        cells[-1] += [f"{number(error['after_one_lap_to_settled']['value'])}×", back, settled]
+        cells[-1] += [times(error["after_one_lap_to_settled"]["value"]), back, settled]
     return pd.DataFrame(cells, columns=header)
+
+
+def times(ratio: float) -> str:
+    """Returns a ratio of errors as text, or – where no run has one."""
+    return "–" if np.isnan(ratio) else f"{number(ratio)}×"
 
 
 def recovered(rows: Sequence[Row]) -> str:
@@ -334,9 +342,11 @@ def _window(error: Row, window: str) -> Row:
 
 
 def _less(row: Row, window: str) -> str:
-    """Returns the difference from `model` in mm, or `tie`."""
-    tied = verdict(row, "model", window=window) == 0
-    return "tie" if tied else _signed(1e3 * _window(row["position_rmse"], window)["less_model"])
+    """Returns the difference from `model` in mm, or `tie`, or – where no run finished with both."""
+    if verdict(row, "model", window=window) == 0:
+        return "tie"
+    less = 1e3 * _window(row["position_rmse"], window)["less_model"]
+    return _signed(less) if np.isfinite(less) else "–"
 
 
 def _signed(value: float) -> str:

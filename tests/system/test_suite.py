@@ -199,6 +199,22 @@ def test_leaders() -> None:
     assert suite_tables.leaders(rows) == [["a", *["model, rls"] * 5]]
 
 
+def test_all_runs_failed() -> None:
+    """Who lost all runs is not the best where each lost one: 19 of 20 pairs are no tie; no cell says nan."""
+    random = np.random.default_rng(0)
+    case = Case("a", "step", (mrctl.Scenario(laps=6),) * 20, change=3, back=5)
+    lost, one = np.full(20, np.nan), np.where(np.arange(20), 0.0, np.nan)
+    errors = {"none": lost, "model": 2 + one, "rls": 1 + one}
+    runs = {name: laps_of(*(own + 0.1 * random.random(20) for _ in range(6))) for name, own in errors.items()}
+    rows = suite.compare([case], {"a": runs})
+    assert stats.binomtest(19, 19).pvalue < 0.05
+    assert suite_tables.leaders(rows) == [["a", *["rls"] * 5]]
+    cells = suite_tables.positions(rows), suite_tables.recovery(rows)
+    assert [cells[0].iloc[0, 5], *cells[1].iloc[0, [3, 6, 7]]] == ["– / – / –", "–", "–", "–"]
+    assert not any("nan" in cell for table in cells for cell in table.to_numpy().ravel())
+    assert "nan" not in report.recoveries(report.Outcome("core", [case], {}, {}, rows, ""))
+
+
 @pytest.mark.usefixtures("plain")
 def test_hindsight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The best fixed feedforward is that of `best_fixed`, and the regret of the model is what it does worse."""
