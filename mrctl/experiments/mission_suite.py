@@ -302,6 +302,8 @@ def budget(found: Found, shown: str) -> Table:
         f"On the nominal plant with a map that is {1e3 * MAP_ERROR:.0f} mm off, a right map lowers the allowance by "
         "the first of three numbers, and then a known posture by the second, or an estimate that is always on the "
         f"reference by the third: {listed} mm."
+        if gains
+        else "On the nominal plant no controller has a finite allowance with each of these maps and estimates."
     )
     header = [
         "plant",

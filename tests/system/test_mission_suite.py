@@ -128,6 +128,17 @@ def test_ties_of_critical_speeds() -> None:
     assert "none differs from `PID`; none differs from `model`." in suite.critical_widths(found, "car").says
 
 
+def test_budget_of_none() -> None:
+    """Who arrives in fewer than 95 % of the draws has no budget; where nobody has one, the sentence says so."""
+    size = len(suite.CONTROLLERS), len(suite.PLANTS), 20
+    needed = np.where(np.arange(20) < 2, np.inf, 0.6) * np.ones(size)
+    found = suite.Found(needed[None], *(needed for _ in range(3)), np.full(20, 0.5), [0.5], 0)
+    says = suite.budget(found, "car").says
+    assert says == "On the nominal plant no controller has a finite allowance with each of these maps and estimates."
+    found = suite.Found(needed[None, ..., 2:], *(needed[..., 2:] for _ in range(3)), np.full(18, 0.5), [0.5], 0)
+    assert "third: `PID` 0.0, 0.0, 0.0; `model`" in suite.budget(found, "car").says
+
+
 def test_words_of_three_mppis() -> None:
     """What is said of the third is in words that tell who is earlier, and the page of results has the same words."""
     lateness = dict(zip(three.ENTRIES, (1.0, 0.5, 0.3), strict=True))
