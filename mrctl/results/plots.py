@@ -320,7 +320,7 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
             at = (number[whole][-1], mean[-1]) if whole.any() else (number[0], np.nan)
             ends.append((float(at[0]), float(at[1]), _counted(label, int(failed.sum()), len(rows)), colour))
         one.set_title(text)
-        one.xaxis.get_major_locator().set_params(integer=True)
+        one.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
         _scale(one, laps[name].values)
         _label_ends(one, ends)
     for one in axes[max(0, len(names) - columns) : len(names)]:  # the lowest of each column
@@ -367,7 +367,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
         for lap in changes:
             one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
         one.set_title(title)
-        one.xaxis.get_major_locator().set_params(integer=True)
+        one.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
         _scale(one, np.concatenate([laps[metric].values.ravel() for laps in cases.values()]))
     for place, one in enumerate(axes):
         one.set_xlabel("lap" if place + columns >= len(cases) else "")

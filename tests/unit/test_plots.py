@@ -352,6 +352,17 @@ def test_laps_by_case():
     assert "(J)" in first.get_ylabel()
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_numbers_of_laps(count):
+    """Laps are whole, also where there is one alone."""
+    laps = metrics.per_lap(make()).isel(lap=slice(count)).assign(laps=("run", [count] * 2))
+    for figure in (plots.learning_curve(laps), plots.laps_by_case({"nominal": laps}, "v_rmse")):
+        FigureCanvasAgg(figure).draw()
+        for axes in figure.axes:
+            low, high = axes.get_xlim()
+            assert [x for x in axes.get_xticks() if low <= x <= high] == [*range(1, count + 1)]
+
+
 def test_mean_of_the_runs_that_finished():
     """A mean does not fall where the worst run fails, and the legend counts the failures of all panels."""
     result = make(["fel", "fel", "none", "none"])
