@@ -222,14 +222,6 @@ def suite_text(table: Table, everything: str) -> str:
     return "\n\n".join([says, title, short, *folded])
 
 
-def _random(table: Table) -> list[Mapping[str, Any]]:
-    """Returns the rows of the random worlds in a table of `mrctl suite`; refuses one that has none."""
-    rows = [row for row in table["rows"] if row["part"] == "random"]
-    if not rows:
-        raise InputError("random: the suite drove no random worlds")
-    return rows
-
-
 def random_text(everything: str) -> str:
     """Returns the statement and the table of the random worlds from the content of a suite's `table.md`."""
     return next(text for title, text in sections(everything).items() if title.startswith("Random"))
@@ -338,9 +330,9 @@ def _compared(table: Table, rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _random_section(folder: Path) -> str:
     table = _read(folder / "table.json", "rows", "mode")
-    rows = _random(table)
-    command = f"{_compared(table, rows)} --random {max(row['runs'] for row in rows)}"
-    return _section(command, table, random_text(_text(folder / "table.md")))
+    if not any(row["part"] == "random" for row in table["rows"]):
+        raise InputError("random: the suite drove no random worlds")
+    return _section(_suite_command(table), table, random_text(_text(folder / "table.md")))
 
 
 def _held_out_section(folder: Path) -> str:

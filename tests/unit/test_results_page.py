@@ -253,11 +253,13 @@ def test_random_worlds(suite: Path, tmp_path: Path) -> None:
     """A suite's random worlds become a section of their own; a suite without any is refused in one line."""
     out, error = tmp_path / "RESULTS.md", {"value": 0.0123, "low": 0.0121, "high": 0.0125, "samples": 9}
     rows = [{"part": "random", "feedforward": name, "runs": 9, "v_rmse": error} for name in ("none", "fel")]
+    more = [rows[0] | {"part": "floor", "runs": 1}]
     text = f"{TABLES}\n## Random robots (full)\n\nfel wins.\n\n| world |\n| --- |\n\n## More\n\nNo."
-    folder = written(tmp_path / "worlds", {"rows": [{"part": "one"}, *rows], "mode": "full"}, text)
+    folder = written(tmp_path / "worlds", {"rows": [*more, *rows], "mode": "full"}, text)
     assert results_page.command(["--random", str(folder), "--out", str(out)]) == 0
     found = results_page.sections(out.read_text())["Random worlds"]
-    assert found.startswith(f"`mrctl suite --full --feedforward none fel --random 9` made this {MADE}")
+    command = "mrctl suite --full --feedforward none fel --seeds 1 --random 9"  # the replicates determine the floors
+    assert found.startswith(f"`{command}` made this {MADE}")
     assert found.endswith("fel wins.\n\n| world |\n| --- |")
     (folder / "table.json").write_text((suite / "table.json").read_text())
     assert results_page.command(["--random", str(folder), "--out", str(out)]) == 2
