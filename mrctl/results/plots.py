@@ -416,7 +416,9 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         motion: As for `mrctl.results.excitation.excitation`.
         run: Index of the run whose features are drawn, one line each.
     """
-    found = exciting.excitation(result, span, motion)
+    found, runs = exciting.excitation(result, span, motion), as_runs(result)
+    kept = {name: ("run", runs[name].values) for name in ("feedforward", "failed") if name in runs.variables}
+    found = found.assign_coords(kept)  # for the colours, and for the failures in the legend
     figure, axes = _figure(COLUMN_WIDTH, 1.2 * COLUMN_WIDTH, rows=2)
     curves = _curves(found, None, None)
     _signals(axes[0], curves, "least", r"$\lambda_{\min}$ (1)")
@@ -636,10 +638,9 @@ def _references(axes: Axes, curves: Iterable[Curve], x: str, y: str) -> None:
 
 def _cross(axes: Axes, data: xr.Dataset, x: np.ndarray, y: np.ndarray) -> None:
     """Marks the last sample of a run that fails within view."""
-    dead = ~np.isfinite(x + y)
-    if "failed" in data and bool(data["failed"]) and dead.any() and not dead[0]:
-        last = int(np.argmax(dead)) - 1
-        axes.plot(x[last], y[last], "X", ms=5, color="black", mec="white", mew=0.5, zorder=5)
+    alive = np.flatnonzero(np.isfinite(x + y))
+    if "failed" in data and bool(data["failed"]) and len(alive) and alive[-1] < len(x) - 1:
+        axes.plot(x[alive[-1]], y[alive[-1]], "X", ms=5, color="black", mec="white", mew=0.5, zorder=5)
 
 
 def _counted(label: str, failed: int, count: int) -> str:

@@ -7,6 +7,7 @@ import xarray as xr
 from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.record import InputError
 from mrctl.results import plots
+from mrctl.results.controllers import CONTROLLERS
 from mrctl.results.excitation import alone, excitation, gram, parameter_error, strength
 
 PERIOD = 0.01
@@ -134,3 +135,16 @@ def test_plot(robot, tmp_path):
     assert len(second.lines) == 8 and first.get_yscale() == second.get_yscale() == "log"
     plots.save(figure, tmp_path, "excitation")
     assert (tmp_path / "excitation.png").stat().st_size > 5000
+
+
+def test_plot_of_a_failure(robot):
+    """Runs have the colours of their controllers; who failed is counted in the legend, with a cross where it did."""
+    runs = result(robot, RNG.uniform(0.1, 1, (2, 300, 2)), dead=200).assign(failed=("run", [True, False]))
+    runs = runs.assign_coords(label=("run", ["heavy", "light"]), feedforward=("run", ["none", "model"]))
+    figure = plots.excitation(runs, span=1.0, run=1)
+    first = figure.axes[0]
+    colours = [line.get_color() for line in first.lines if line.get_marker() == "None"]
+    assert colours == [CONTROLLERS[name][1] for name in ("none", "model")]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["heavy (failed)", "light"]
+    (cross,) = (line for line in first.lines if line.get_marker() == "X")
+    assert cross.get_xdata() == [PERIOD * 199]
