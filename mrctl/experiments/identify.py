@@ -117,7 +117,8 @@ def run(world: str, robot: RobotFile, perturbation: Perturbation, sensing: Sensi
     if json:
         rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error, "identifiable": c.identifiable} for c in found]
         source = {"versions": versions(), "machine": machine(), "world": world, "robot": robot.model_dump()}
-        return json_text(source | {"sensing": sensing.model_dump(mode="json"), "constants": rows})
+        source |= {"perturbation": perturbation.model_dump(mode="json"), "sensing": sensing.model_dump(mode="json")}
+        return json_text(source | {"seed": seed, "constants": rows})
     return text(found)
 
 

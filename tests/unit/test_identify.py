@@ -1,11 +1,15 @@
 """Identification against equation (3) itself, written out here: a drive is integrated, measured and identified."""
 
+import json
+
 import numpy as np
 import pytest
 
 from mrctl.experiments import identify
 from mrctl.experiments.identify import HOLD_TIME, Drive, derivative, drive_constants, lines, signals, turn_constants
-from mrctl.theory.robot import Robot
+from mrctl.sensing.tiers import Sensing
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import CAR, Robot, RobotFile
 
 
 def integrate(robot: Robot, volts, start):
@@ -175,3 +179,14 @@ def test_signals(robot):
         assert np.abs(omega_dot).max() < robot.max_rotation_acceleration
         assert np.abs(volts).max() < robot.supply
         assert (np.abs(omega).max() > 0.05) == turns
+
+
+def test_json_says_what_was_identified(monkeypatch):
+    """All arguments can be read back: the true values are those of the perturbed robot."""
+    asked = []
+    monkeypatch.setattr(identify, "identify", lambda *arguments: asked.append(arguments) or [])
+    given = "flat", CAR, Perturbation(mass_factor=1.5), Sensing(tier="field"), 7
+    found = json.loads(identify.run(*given, json=True))
+    kinds = {"robot": RobotFile, "perturbation": Perturbation, "sensing": Sensing}
+    back = {name: kind.model_validate(found[name]) for name, kind in kinds.items()}
+    assert asked == [(found["world"], *back.values(), found["seed"])] == [given]
