@@ -172,9 +172,8 @@ def _limited(run: xr.Dataset) -> list[str]:
     if not beyond.any():
         return []
     time, first = run.attrs["control_period"] * beyond.sum(), float(run["time"][beyond.argmax()])
-    return [
-        f"feedforward beyond the supply for {time:.2f} s, from {first:.2f} s on: the guard limited it to the supply"
-    ]
+    bound = "the supply" + " or the largest yaw rate" * (run["steering"].item() == "rigid")
+    return [f"feedforward beyond {bound} for {time:.2f} s, from {first:.2f} s on: the guard limited it to {bound}"]
 
 
 def _unreached(scenario: Scenario, run: xr.Dataset) -> list[str]:
