@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -310,6 +311,9 @@ def figure(table: dict[str, Any]) -> Figure:
     frequency = table["frequency"]
     marks = np.unique(np.geomspace(1, len(frequency), 30).astype(int) - 1).tolist()  # dots evenly spread
     rows, loops = table["responses"], list(dict.fromkeys(map(_name, table["responses"])))
+    delays = [1e3 * row["delay"] for row in rows if _name(row) == loops[0]]
+    many = len(delays) > len(plots.COLOURS)
+    colours = mpl.colormaps["viridis"](np.linspace(0, 0.9, len(delays))) if many else plots.COLOURS
     height = len(loops) // 2
     drawn = Figure(figsize=(plots.PAGE_WIDTH, 0.35 * height * plots.PAGE_WIDTH + 0.5), layout="constrained")
     panels = list(drawn.subplots(height, 2, sharex=True, sharey=True).flat)
@@ -317,15 +321,13 @@ def figure(table: dict[str, Any]) -> Figure:
         axes.axhspan(-2, 0, color="0.93", zorder=0)
         for k, row in enumerate(r for r in rows if _name(r) == name):
             for kind, style in STYLES.items():
-                colour = plots.COLOURS[k % len(plots.COLOURS)]
-                axes.plot(frequency, row[kind]["real"], color=colour, markevery=marks, **style)
+                axes.plot(frequency, row[kind]["real"], color=colours[k], markevery=marks, **style)
         axes.set(xscale="log", ylim=(-0.8, 1.6), title=name)
     for axes in panels[-2:]:
         axes.set_xlabel("ω (rad/s)")
     for axes in panels[::2]:
         axes.set_ylabel(r"Re $T(\mathrm{j}\omega)$")
-    delays = [1e3 * row["delay"] for row in rows if _name(row) == loops[0]]
-    handles = [Line2D([], [], color=c, label=f"{d:g} ms") for d, c in zip(delays, plots.COLOURS, strict=False)]
+    handles = [Line2D([], [], color=c, label=f"{d:g} ms") for d, c in zip(delays, colours, strict=False)]
     handles += [Line2D([], [], color="0.3", label=RESPONSES[kind], **style) for kind, style in STYLES.items()]
     drawn.legend(handles=handles, loc="outside upper center", ncols=3)
     return drawn

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from scipy import signal
 
 import mrctl
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import sampled_loop
 from mrctl.control.pid import Pid
+from mrctl.experiments import tuning
 from mrctl.experiments.paper import IDEAL
 from mrctl.experiments.response import PERIOD_TICKS, Shaker, estimate, lines, measure, multisine, refine, safety
 from mrctl.experiments.tuning import design, statement
@@ -245,3 +247,18 @@ def test_foretells_instability(steering, channel):
     early, late = slice(300, 800), slice(-500, None)
     assert np.std(settled[late]) < 0.2 * np.std(settled[early])
     assert not np.std(shaken[late]) < 0.9 * np.std(shaken[early])  # NaN: it drove off
+
+
+@pytest.mark.parametrize("count", [7, 8])
+def test_delays_in_a_figure(count):
+    """Each delay has a colour of its own and an entry in the legend, however many there are."""
+    loops = [{"steering": "caster", "channel": channel} for channel in (0, 1)]
+    answers = {kind: {"real": [1.0, 0.5]} for kind in tuning.RESPONSES}
+    rows = [loop | answers | {"delay": 0.01 * k} for loop in loops for k in range(count)]
+    drawn = tuning.figure({"frequency": [1.0, 10.0], "responses": rows})
+    lines = drawn.axes[0].lines[:: len(tuning.RESPONSES)]
+    assert len({to_hex(line.get_color()) for line in lines}) == count
+    shown = drawn.legends[0]
+    entries = dict(zip([text.get_text() for text in shown.get_texts()], shown.legend_handles, strict=True))
+    for k, line in enumerate(lines):
+        assert to_hex(entries[f"{10 * k} ms"].get_color()) == to_hex(line.get_color())
