@@ -37,12 +37,12 @@ WON = "share of runs below {}: V / θ̇ / position [interval of position]"
 HARMLESS = f"share of runs at most {NO_WORSE:g}× PID: V / θ̇ / position [interval of position]"
 CONVERGED = f"laps to {RECOVERED_RATIO:g}× the final V / θ̇ / position"
 READING_OF_POSITIONS = (
-    "Lap 1, all laps and the last lap hold the mean over the runs that finished, for random worlds the median, with "
-    "its 95 % interval. Less `model` is the mean of the differences from `model`, run by run, for random worlds their "
-    "median, or a tie where the sign test does not tell the two apart. Regret is not paired: it is the mean over all "
-    "laps less that of `hindsight`, for random worlds a difference of two medians, each over the runs that finished "
-    "with that feedforward, or a tie up to the floor of differences. Excess is a mean over the runs that finished, for "
-    "random worlds too."
+    "Lap 1, all laps and the last lap each hold the mean over the runs that drove all of it, for random worlds the "
+    "median, with its 95 % interval. Less `model` is the mean of the differences from `model`, run by run, for random "
+    "worlds their median, or a tie where the sign test does not tell the two apart. Regret is not paired: it is the "
+    "mean over all laps less that of `hindsight`, for random worlds a difference of two medians, each over the runs "
+    "that finished with that feedforward, or a tie up to the floor of differences. Excess is a mean over the runs "
+    "that finished, for random worlds too."
 )
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
 
