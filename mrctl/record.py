@@ -285,6 +285,11 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})
         message = f"'kind' is {context.get('tag')!r}, which is none of {context.get('expected_tags')}"
+    if first["type"] == "missing" and isinstance(first["loc"][-1], int):
+        field, message = field.rpartition(".")[0], f"has {len(first['input'])} values, which are too few"
+    if first["type"] == "too_long":
+        context = first.get("ctx", {})
+        message = f"has {context.get('actual_length')} values, at most {context.get('max_length')} are allowed"
     if first["type"] == "tuple_type":  # a file has no tuples
         tables = (
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""

@@ -232,6 +232,9 @@ def test_names_in_the_place_of_records():
         ({"reference": "circle"}, "reference: must be a record, or a table of its fields"),
         ({"robot": 3}, "robot: must be a record, or a table of its fields, or its path"),
         ({"events": Event(time=1, learning=False)}, "events: must be a list of records (and 7 more)"),
+        ({"events": [{"time": 1.0, "push": [20.0, 0.0]}]}, "events.0.push: has 2 values, which are too few"),
+        ({"goal": [1.0, 2.0]}, "goal: has 2 values, which are too few"),
+        ({"goal": [1.0, 2.0, 3.0, 4.0]}, "goal: has 4 values, at most 3 are allowed"),
         (
             {"reference": Circle},
             "reference: must be a record, or a table of its fields, of which `kind` says what it is",
