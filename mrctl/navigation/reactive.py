@@ -250,7 +250,6 @@ class Reactive(ABC):
     help, it goes back a little on its `Trail`, and plans again.
 
     Attributes:
-        bounds: What twists each robot can drive, as of its `Agent`.
         considered: What led to the last twist of each robot; None before the first one, and while it goes back.
     """
 
@@ -272,23 +271,27 @@ class Reactive(ABC):
         """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
         discs, fields = cover(self._planners[0].vehicle.footprint, *BODY_DISCS), dict[Hashable, Field]()
-        for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
+        for planner, start in zip(self._planners, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:
                 places = planner.first.sample(np.linspace(0, planner.first.period, 200)).pose[:, :2]
                 fields[own] = field_around(places, planner.sight, reach(discs))
+            bounds = Bounds.of(self._robot, planner.first.speed)
             self._agents.append(Agent(planner, bounds, discs, fields[own], start[:2], period))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
         self._agents[row].follow(plan, self._period * self._tick)
-        self.bounds[row] = self._agents[row].bounds
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.MotionStage`."""
         self._agents[row].see(scan)
+
+    @property
+    def bounds(self) -> list[Bounds]:
+        """What twists each robot can drive."""
+        return [agent.bounds for agent in self._agents]
 
     @property
     def last(self) -> Array:

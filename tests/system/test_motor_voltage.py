@@ -82,32 +82,26 @@ def test_feedforward_limited(steering):
     assert not mrctl.simulate(lap.replace(prior="model")).feedforward_limited.any()
 
 
-def test_run_says_so(tmp_path, monkeypatch, capsys):
+OUTPUTS = {  # of the feedforward, and what the guard limits it to
+    "np.tile([40.0, 0.0], (len(command), 1))": ("compliant", "the supply"),
+    # with steered wheels the second channel is no voltage: 9 rad/s are beyond the largest yaw rate
+    "command * [self.per_speed, 0.0] + [0.0, 9.0]": ("rigid", "the supply or the largest yaw rate"),
+}
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_run_says_so(output, tmp_path, monkeypatch, capsys):
     """`mrctl run` prints for how long; the table's saturation counts limits on the sum alone."""
+    steering, bound = OUTPUTS[output]
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.py").write_text(
         "import numpy as np\n"
         "class Demands:\n"
-        "    def __init__(self, robot, size): self.size = size\n"
-        "    def output(self, command, derivative): return np.tile([40.0, 0.0], (self.size, 1))\n"
-        "    def learn(self, *given): pass\n"
-    )
-    assert main(["run", "--laps", "1", "--controller", "own.py:Demands", "reference:circle"]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("feedforward beyond"))
-    assert line.endswith("from 0.00 s on: the guard limited it to the supply")
-
-
-def test_limit_of_a_yaw_rate(tmp_path, monkeypatch, capsys):
-    """With steered wheels the second channel is no voltage: 9 rad/s are beyond the largest yaw rate, not the supply."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own.py").write_text(
-        "import numpy as np\n"
-        "class Turns:\n"
         "    def __init__(self, robot, size): self.per_speed = 1 / robot.velocity_gain\n"
-        "    def output(self, command, derivative): return command * [self.per_speed, 0.0] + [0.0, 9.0]\n"
+        f"    def output(self, command, derivative): return {output}\n"
         "    def learn(self, *given): pass\n"
     )
-    words = ["--steering", "rigid", "--controller", "own.py:Turns", "reference:circle"]
+    words = ["--steering", steering, "--controller", "own.py:Demands", "reference:circle"]
     assert main(["run", "--laps", "1", *words]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("feedforward beyond"))
-    assert line.endswith("from 0.00 s on: the guard limited it to the supply or the largest yaw rate")
+    assert line.endswith(f"from 0.00 s on: the guard limited it to {bound}")
