@@ -269,12 +269,7 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] == "extra_forbidden":
         *parents, name = first["loc"]
         known = [field for one in _records_at(record, parents) for field in one.model_fields]
-        meant = nearest(str(name), known)
-        message = "there is no such field"
-        if meant:
-            message += f"; did you mean {meant}?"
-        elif 0 < len(known) <= 12:
-            message += f"; there are {', '.join(known)}"
+        message = "there is no such field" + instead(str(name), known)
     if first["type"] in ("model_type", "model_attributes_type"):
         names = {one.named_by for one in _records_at(record, first["loc"])} - {""}
         message = ", or its ".join(["must be a record, or a table of its fields", *sorted(names)])
@@ -318,6 +313,13 @@ def nearest(name: str, known: Sequence[str]) -> str | None:
     ]  # fmt: skip
     found = difflib.get_close_matches(name, begun or inside or known, 1, cutoff=0.0 if begun or inside else 0.6)
     return found[0] if found else None
+
+
+def instead(name: str, known: Sequence[str]) -> str:
+    """Returns the end of a message about an unknown name: the one that is probably meant, or all if they are few."""
+    if meant := nearest(name, known):
+        return f"; did you mean {meant}?"
+    return f"; there are {', '.join(known)}" if 0 < len(known) <= 12 else ""
 
 
 def _records_at(record: type[Record] | None, path: Sequence[int | str]) -> list[type[Record]]:

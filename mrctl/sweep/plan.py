@@ -23,7 +23,7 @@ import pyarrow as pa
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
-from mrctl.record import InputError, Record, printable
+from mrctl.record import InputError, Record, instead, printable
 from mrctl.results.dataset import FAULTS, SIGNALS
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import FEEDFORWARDS, Scenario, feedforward_name, replicates
@@ -528,7 +528,7 @@ def _put(data: Any, field: str, value: object) -> Any:  # noqa: ANN401
         if part not in names:
             Scenario.refuse_moved(field)
             where = ".".join(parts[:depth]) or "the scenario"
-            raise InputError(f"{field}: no {part!r} in {where}" + (f", which has {', '.join(names)}" if names else ""))
+            raise InputError(f"{field}: no {part!r} in {where}{instead(part, list(names))}")
         passed.append((node, names[part]))
         node = node[names[part]]
     for node, key in reversed(passed):

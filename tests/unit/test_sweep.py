@@ -219,7 +219,11 @@ def grid(start, stop, count):
 @pytest.mark.parametrize(
     ("message", "axes", "changes"),
     [
-        ("perturbation.mas: no 'mas' in perturbation, which has mass", [axis("perturbation.mas", values=[1])], {}),
+        (
+            "perturbation.mas: no 'mas' in perturbation; did you mean mass_factor\\?",
+            [axis("perturbation.mas", values=[1])],
+            {},
+        ),
         ("events.0.time: no '0' in events", [axis("events.0.time", values=[1])], {}),
         ("laps.x: no 'x' in laps", [axis("laps.x", values=[1])], {}),
         ("perturbation.mass_factor: .* greater than", [axis(MASS["field"], uniform=[0, 1])], {}),
