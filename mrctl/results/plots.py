@@ -289,13 +289,15 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         metrics: Names in `METRICS`; each has a panel.
 
     Raises:
-        InputError: A metric is unknown, or none is given.
+        InputError: A metric is unknown, or none is given, or the result has no run.
     """
     if not metrics:
         raise InputError("metrics: at least one is needed")
     names = [known(name) for name in metrics]
     check_kind(result)
     laps = as_runs(result if "lap" in result.dims else per_lap(result))
+    if not laps.sizes["run"]:
+        raise InputError("result: no runs")
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     figure, axes = _figure(
@@ -425,7 +427,8 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
     for order, name in enumerate(found["feature"].values):
         signal = found["alone"].isel(run=run).sel(feature=name).values
         axes[1].plot(found["time"].values, signal, label=PARAMETERS[order], **_line(order))
-    axes[1].set(xlabel="time (s)", ylabel="excitation alone (1)")
+    whose = f", {runs['label'].values[run]}" if runs.sizes["run"] > 1 else ""
+    axes[1].set(xlabel="time (s)", ylabel=f"excitation alone (1){whose}")
     for one in axes:
         if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # on a circle every value is 0
             one.set_yscale("log", nonpositive="mask")

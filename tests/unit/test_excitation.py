@@ -142,7 +142,8 @@ def test_plot_of_a_failure(robot):
     runs = result(robot, RNG.uniform(0.1, 1, (2, 300, 2)), dead=200).assign(failed=("run", [True, False]))
     runs = runs.assign_coords(label=("run", ["heavy", "light"]), feedforward=("run", ["none", "model"]))
     figure = plots.excitation(runs, span=1.0, run=1)
-    first = figure.axes[0]
+    first, second = figure.axes
+    assert second.get_ylabel() == "excitation alone (1), light"  # whose, where there are several
     colours = [line.get_color() for line in first.lines if line.get_marker() == "None"]
     assert colours == [CONTROLLERS[name][1] for name in ("none", "model")]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["heavy (failed)", "light"]

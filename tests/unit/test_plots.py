@@ -306,6 +306,13 @@ ALL = {
 
 
 @pytest.mark.parametrize("name", ALL)
+def test_no_runs(name):
+    """An empty selection, as of runs that failed where none did, is refused in one line."""
+    with pytest.raises(InputError, match="^result: no (runs|samples)$"):
+        ALL[name](make().isel(run=slice(0, 0)))
+
+
+@pytest.mark.parametrize("name", ALL)
 def test_units_on_axes(name):
     """A single run draws too, and every labelled axis but the lap number has a unit in brackets."""
     figure = ALL[name](make().isel(run=1))
