@@ -242,22 +242,21 @@ def test_many_visitors(server, visits, together):
 
 
 def test_rough_treatment(server, capfd):
-    """Two hundred random inputs, sensible and not, from visitors that come and go: it drives on, and leaks nothing."""
+    """Random values of 112 inputs, sensible or not, from visitors that come and go: it drives on, and leaks nothing."""
     rng = random.Random(1)
     live = Live([Scenario()], server)
-    inputs = list(server.gui._gui_input_handle_from_uuid.values())
-    last = server.gui.add_number("last", 0.0)
+    inputs = rng.sample(list(server.gui._gui_input_handle_from_uuid.values()), 112)
+    last = server.gui.add_number("last", -1.0)
     live.session.step()  # compiles the laws, so that the visitors come while it drives
     before = threading.active_count()
     loop = threading.Thread(target=live.run)
     loop.start()
     objects = []
     try:
-        for round_ in range(12):
+        for round_ in range(8):
             with client(server) as visitor:
                 visitor.send(packed(CAMERA))
-                for _ in range(17):
-                    handle = rng.choice(inputs)
+                for handle in inputs[round_::8]:
                     value = _random_value(handle, rng)
                     visitor.send(packed(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value})))
                     with contextlib.suppress(TimeoutError):
@@ -267,13 +266,17 @@ def test_rough_treatment(server, capfd):
                     visitor.send(rng.choice([b"", b"\x00" * 40, b"\xc1", packed(CAMERA)[:-7], "text"]))
                     with contextlib.suppress(ConnectionClosed):
                         visitor.recv(timeout=0.2)
+            with client(server) as visitor:  # viser handles messages in order: all others are handled before this one
+                visitor.send(packed(_messages.GuiUpdateMessage(last._impl.uuid, {"value": round_})))
+                until(lambda round_=round_: last.value == round_, 30)
+            handled = threading.Event()
+            live.ask(handled.set)
+            assert handled.wait(300)
+            until(lambda: not live._changed_inputs, 300)
             assert loop.is_alive()
-            if round_ > 5:
+            if round_ > 2:
                 gc.collect()
                 objects.append(len(gc.get_objects()))
-        with client(server) as visitor:  # viser handles messages in order: all others are handled before this one
-            visitor.send(packed(_messages.GuiUpdateMessage(last._impl.uuid, {"value": 1.0})))
-            until(lambda: last.value == 1.0, 30)
         # Seen on two busy cores: the first tick took 114 s without a cache, as numba compiled `estimate` in 57 s and
         # `update` in 43 s, and `update` again in some seconds with another feedforward; 30 inputs that each began
         # another run took 20 to 35 s. The step has the loop do all that before it is ready; what follows is driving.
@@ -310,7 +313,7 @@ def _random_value(handle, rng):
 def test_record(tmp_path, capsys):
     """GIF and MP4 of a result show the robot on its way; where MuJoCo cannot draw, one line says so."""
     result, driven = tmp_path / "result.zarr", simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")])
-    save(driven, result)
+    save(driven.isel(time=slice(0, 50)), result)  # half a second of it
     save(driven.isel(time=slice(0, 1)), tmp_path / "sample.zarr")
     gif, mp4 = (["record", str(result), "--out", str(tmp_path / name)] for name in ("run.gif", "run.mp4"))
     one = ["record", str(tmp_path / "sample.zarr"), "--out", str(tmp_path / "one.gif")]
@@ -321,9 +324,9 @@ def test_record(tmp_path, capsys):
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and "EGL" in done.stderr
     else:
         with Image.open(tmp_path / "run.gif") as video:
-            assert (video.n_frames, video.size, video.info["duration"]) == (13, (640, 360), 80)
+            assert (video.n_frames, video.size, video.info["duration"]) == (7, (640, 360), 80)
             first = np.asarray(video.convert("RGB"), float)
-            video.seek(12)
+            video.seek(6)
             last = np.asarray(video.convert("RGB"), float)
             assert (np.abs(last - first).max(axis=-1) > 60).sum() > 500
             (own,) = looks([""], ["none"])  # of the trail and the label
@@ -331,7 +334,7 @@ def test_record(tmp_path, capsys):
         with Image.open(tmp_path / "one.gif") as video:
             assert (video.n_frames, video.size) == (1, (640, 360))  # of the one sample
         about, *pictures = imageio_ffmpeg.read_frames(tmp_path / "run.mp4")
-        assert (about["size"], about["fps"], len(pictures)) == ((1280, 720), 5, 5)
+        assert (about["size"], about["fps"], len(pictures)) == ((1280, 720), 5, 3)
         first, last = (np.frombuffer(pictures[k], np.uint8).reshape(-1, 3).astype(float) for k in (0, -1))
         assert (np.abs(last - first).max(axis=-1) > 60).sum() > 2000
     (tmp_path / "there.gif").touch()
