@@ -74,8 +74,8 @@ def started() -> Iterator[KernelManager]:
 
 
 if __name__ == "__main__":
-    with started() as kernel:
+    with tempfile.TemporaryDirectory() as folders, started() as kernel:  # which may not lose the folder that it is in
         for path in [FOLDER / name for name in sys.argv[1:]] or sorted(FOLDER.glob("*.ipynb")):
-            with tempfile.TemporaryDirectory() as folder:
-                nbformat.write(cleaned(executed(path, Path(folder), kernel)), path)
+            (folder := Path(folders, path.stem)).mkdir()
+            nbformat.write(cleaned(executed(path, folder, kernel)), path)
             print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB")
