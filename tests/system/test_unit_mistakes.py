@@ -198,7 +198,7 @@ def test_ends_in_time(
     mistake: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """The whole takes little more than its limit, even if no unit is suspected; no error of a check ends it."""
-    monkeypatch.setattr(examination, "MAX_SECONDS", 0.3)
+    monkeypatch.setattr(examination, "MAX_SECONDS", 0.1)
     monkeypatch.setattr(examination, "_impossible", lambda model, report: ())
     (tmp_path / "mine.xml").write_text(ROBOT.replace(*MISTAKES[mistake]))
     start = time.process_time()
