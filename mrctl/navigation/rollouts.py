@@ -24,6 +24,7 @@ PLACE_COST, HEADING_COST, NEAR_COST, TOUCH_COST = 10.0, 1.0, 5.0, 1000.0
 END_HEADING_COST = 5.0  # 1/s, where the plan has ended: 0.2 rad cost what 0.1 m do, as by `arrived`
 NEAR_DISTANCE = 0.1  # m from obstacles, below which it costs
 MAX_DEEPER = 0.005  # m, by which discs that touch an obstacle already may come nearer
+WIDER = 1.001  # factor on the squared distance up to which a mover is looked at closely, for rounding
 
 
 class Bounds(NamedTuple):
@@ -101,8 +102,8 @@ def _path(pose: Array, twists: Array, step: float) -> Array:
 
 @kernel
 def body_clearance(
-    x: float, y: float, c: float, s: float, time: float, circle: tuple[float, float, float], discs: Array,
-    distance: Array, left: float, low: float, resolution: float, movers: Array,
+    x: float, y: float, c: float, s: float, k: int, circle: tuple[float, float, float], discs: Array,
+    distance: Array, left: float, low: float, resolution: float, movers: Array, places: Array,
 ) -> float:  # fmt: skip
     """Returns the distance in m of the discs of a robot from all that it knows, or `NEAR_DISTANCE` where it is larger.
 
@@ -111,7 +112,7 @@ def body_clearance(
         y: y of the robot in m.
         c: Cosine of its heading.
         s: Sine of its heading.
-        time: Time in s, from now on, for which what moves goes on as it does now.
+        k: How many steps from now on it is there.
         circle: x and y of the centre in the robot's frame and radius in m of a circle that holds all its discs.
         discs: `Scene.discs`.
         distance: Distances of `Scene.field`, which is taken apart as for `value`.
@@ -119,16 +120,19 @@ def body_clearance(
         low: y of its origin in m.
         resolution: Side of its cells in m.
         movers: `Scene.movers`.
+        places: x and y in m where they are after each step, if they go on as they do now, `(steps + 1, M, 2)`.
     """
     free, far = NEAR_DISTANCE, circle[2] + NEAR_DISTANCE
-    px, py = x + c * circle[0] - s * circle[1], y + s * circle[0] + c * circle[1]
-    if value(distance, left, low, resolution, px, py) < far:  # else no disc can be nearer than NEAR_DISTANCE
+    cx, cy = x + c * circle[0] - s * circle[1], y + s * circle[0] + c * circle[1]
+    if value(distance, left, low, resolution, cx, cy) < far:  # else no disc can be nearer than NEAR_DISTANCE
         for d in range(len(discs)):
             px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
             free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
     for m in range(len(movers)):
-        mx, my = movers[m, 0] + time * movers[m, 2] - x, movers[m, 1] + time * movers[m, 3] - y
-        mx, my = c * mx + s * my, c * my - s * mx
+        mx, my = places[k, m, 0], places[k, m, 1]
+        if (mx - cx) ** 2 + (my - cy) ** 2 > WIDER * (movers[m, 4] + far) ** 2:
+            continue
+        mx, my = c * (mx - x) + s * (my - y), c * (my - y) - s * (mx - x)
         if (mx - circle[0]) ** 2 + (my - circle[1]) ** 2 < (movers[m, 4] + far) ** 2:
             for d in range(len(discs)):
                 ahead, aside = mx - discs[d, 0], my - discs[d, 1]
@@ -171,7 +175,12 @@ def roll_out(
     steps, circle = len(nominal), enclosing_circle(discs)
     # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
     x, y, c, s = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2])
-    least = body_clearance(x, y, c, s, 0.0, circle, discs, distance, left, low, resolution, movers)
+    places = np.empty((steps + 1, len(movers), 2))
+    for k in range(steps + 1):
+        for m in range(len(movers)):
+            for i in range(2):
+                places[k, m, i] = movers[m, i] + k * step * movers[m, 2 + i]
+    least = body_clearance(x, y, c, s, 0, circle, discs, distance, left, low, resolution, movers, places)
     least = least - MAX_DEEPER if least <= 0 else 0.0
     # While a request is held, what is missing of it decays: to `rest` at the end of a step, to `mean` on its average.
     rest = np.exp(-step / lag) if lag > 0 else 0.0
@@ -211,9 +220,7 @@ def roll_out(
             turned = (HEADING_COST if k < end else END_HEADING_COST) * (1 - c * targets[k, 2] - s * targets[k, 3])
             cost += step * (PLACE_COST * (dx * dx + dy * dy) + turned)
             if k == 0 or speed != 0.0 or rotation != 0.0 or len(movers) > 0:  # else it rests, and so does all around it
-                free = body_clearance(
-                    x, y, c, s, (k + 1) * step, circle, discs, distance, left, low, resolution, movers
-                )
+                free = body_clearance(x, y, c, s, k + 1, circle, discs, distance, left, low, resolution, movers, places)
             if free <= least:
                 judged = True
                 cost += TOUCH_COST * (1 + (steps - k) / steps)  # the earlier, the worse
