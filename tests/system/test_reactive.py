@@ -24,13 +24,15 @@ from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import RobotFile
 
 PLANNED = Scenario(prior="model", learner="none")
+REACTIVE: tuple[Avoid, ...] = ("window", "mppi")
+AVOIDERS: tuple[Avoid, ...] = ("barrier", *REACTIVE)
 FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
 BOUNDS = Bounds(1.3, 2.7, 3.9, 1.35, 5.4)
 
 
-def crossing(speed: float) -> Disc:
-    """A disc that crosses x = 2 m along +y, from y = −1.5 m on; its own x axis is that of its course."""
-    return Disc(x=-1.5, y=-2.0, radius=0.2, course=mrctl.Line(heading=np.pi / 2, speed=speed))
+def crossing(speed: float, side: int = 1) -> Disc:
+    """A disc that crosses x = 2 m along ±y, from y = ∓1.5 m on; its own x axis is that of its course."""
+    return Disc(x=-1.5, y=-2.0 * side, radius=0.2, course=mrctl.Line(heading=side * np.pi / 2, speed=speed))
 
 
 def test_roll_out() -> None:
@@ -122,30 +124,25 @@ def test_lag() -> None:
         Mppi(mrctl.load_robot("car"), 1, lambda *_: None, lag=-0.1)
 
 
-@pytest.mark.parametrize("avoid", ["window", "mppi"])
-def test_crossing(avoid: Avoid) -> None:
-    """A disc that crosses is hit by a robot in track mode, and passed in reactive mode, alone as in a batch."""
+def test_crossing() -> None:
+    """A disc that crosses is hit by a robot in track mode, and passed in reactive mode."""
     shapes = (Disc(x=2.0, y=1.6, radius=0.2), crossing(0.6))
     task = Task(obstacles=Obstacles(shapes=shapes), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
     assert navigate(task, PLANNED).table["outcome"].tolist() == ["collided"]
-    both = navigate(task, PLANNED, compare=["model"], avoid=avoid)
-    assert both.table["outcome"].tolist() == ["arrived"] * 2 and float(both.table["clearance"].to_numpy().min()) > 0.03
-    alone = navigate(task, PLANNED, avoid=avoid).result
-    for name in ("x", "v", "omega_command"):
-        values = both.result[name].values
-        np.testing.assert_array_equal(values[1], values[0])
-        np.testing.assert_array_equal(alone[name].values[0], values[0])
+    for avoid in REACTIVE:
+        table = navigate(task, PLANNED, avoid=avoid).table
+        assert table["outcome"].tolist() == ["arrived"] and table["clearance"].iloc[0] > 0.03, avoid
 
 
-@pytest.mark.parametrize("avoid", ["barrier", "window", "mppi"])
-def test_what_the_map_lacks(avoid: Avoid) -> None:
+def test_what_the_map_lacks() -> None:
     """A box that the map lacks is hit by a robot that looks at its map alone; the lidar shows it to the others."""
     wall, box = Box(x=2.0, y=1.5, length=5.0, width=0.2), Box(x=2.0, y=0.1, length=0.3, width=0.8)
     task = Task(obstacles=Obstacles(shapes=(wall, box)), map=Obstacles(shapes=(wall,)), start=(0, 0, 0), goal=(4, 0, 0))
     assert navigate(task, PLANNED).table["outcome"].tolist() == ["collided"]
-    driven = navigate(task, PLANNED, avoid=avoid)
-    assert np.abs(driven.plan.poses[:, 1]).max() < 0.01  # straight through the box
-    assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03
+    for avoid in AVOIDERS:
+        driven = navigate(task, PLANNED, avoid=avoid)
+        assert np.abs(driven.plan.poses[:, 1]).max() < 0.01  # straight through the box
+        assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03, avoid
 
 
 @pytest.mark.parametrize("start", [1.5, 1.8, 2.0])
@@ -160,7 +157,7 @@ def test_keeps_off(start: float) -> None:
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
 def test_slow(avoid: Avoid) -> None:
     """A robot whose largest speed is 2 cm/s drives at about that speed, and is not taken for one that is stuck."""
-    task = Task(obstacles=Obstacles(shapes=(Disc(x=0.3, y=0.5),)), start=(0, 0, 0), goal=(0.35, 0.0, 0.0))
+    task = Task(obstacles=Obstacles(shapes=(Disc(x=0.3, y=0.5),)), start=(0, 0, 0), goal=(0.22, 0.0, 0.0))
     driven = navigate(task, PLANNED, speed=0.02, avoid=avoid)
     (row,) = driven.table.itertuples()
     assert row.outcome == "arrived" and row.time < 1.3 * row.length / 0.02 and float(driven.result["v"].min()) > -0.01
@@ -187,23 +184,23 @@ def test_backs_off() -> None:
 def test_dead_end(robot: str, avoid: Avoid) -> None:
     """A robot that can reverse leaves a dead end which its map lacks, and in which it cannot turn; the car cannot.
 
-    They see no farther than 1.5 m, and so are in it when they see its end.
+    They see no farther than 1.2 m, and so are in it when they see its end.
     """
     wide = 0.7 if robot == "turtlebot" else 0.8
-    sides = [Box(x=2.6, y=side * (wide / 2 + 0.05), length=2.2, width=0.1) for side in (-1, 1)]
+    sides = [Box(x=1.5, y=side * (wide / 2 + 0.05), length=1.6, width=0.1) for side in (-1, 1)]
     task = Task(
-        obstacles=Obstacles(shapes=(*sides, Box(x=3.75, length=0.1, width=wide + 0.2))),
+        obstacles=Obstacles(shapes=(*sides, Box(x=2.35, length=0.1, width=wide + 0.2))),
         map=Obstacles(),
         start=(0, 0, 0),
-        goal=(6, 0, 0),
+        goal=(3.15, 0, 0),
     )
-    short = {"lidar": {"range": 1.5}}
+    short = {"lidar": {"range": 1.2}}
     own = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": robot}, "sensing": short})
     driven = navigate(task, own, avoid=avoid)
     run, found = driven.result.isel(run=0), driven.table.iloc[0]
     went_back = int(np.argmax(run["v"].values < -0.1)) or run.sizes["time"]  # a sample, from which on it goes back
     way_in = run.isel(time=slice(went_back))
-    assert float(way_in["x"].max()) > 1.9 and float(abs(way_in["y"]).max()) < wide / 2 and found["clearance"] > 0.03
+    assert float(way_in["x"].max()) > 1.1 and float(abs(way_in["y"]).max()) < wide / 2 and found["clearance"] > 0.03
     back = -own.control_period * float(run["v"].where(run["v"] < 0, 0.0).sum())
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
 
@@ -241,8 +238,8 @@ def test_waits(avoid: Avoid) -> None:
     assert float(np.hypot(np.ptp(after["x"].values), np.ptp(after["y"].values))) < 0.005  # it does not creep
 
 
-@pytest.mark.parametrize("avoid", ["window", "mppi"])
-def test_far_door(avoid: Avoid) -> None:
+@pytest.mark.parametrize(("robot", "avoid"), [("car", "window"), ("racecar", "mppi")])
+def test_far_door(robot: str, avoid: Avoid) -> None:
     """Where the plan leads past a blocked door, the robot takes another one, 8 m off, beyond the area of its plan."""
     spans = (-3.0, -1.5), (-0.8, 6.65), (7.35, 12.0)
     walls = [Box(x=2.0, y=(low + high) / 2, length=0.1, width=high - low) for low, high in spans]
@@ -250,8 +247,7 @@ def test_far_door(avoid: Avoid) -> None:
     plug = Box(x=2.0, y=-1.15, length=0.2, width=0.7)
     world = Obstacles(shapes=(*known.shapes, plug))
     task = Task(obstacles=world, map=known, start=(0.0, -0.4, 0.0), goal=(4.0, -0.4, 0.0))
-    turtlebot = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": "turtlebot"}})
-    own = prepared(task, turtlebot, avoid=avoid)[1].replace(laps=8)
+    own = prepared(task, PLANNED.replace(robot=RobotFile(path=robot)), avoid=avoid)[1].replace(laps=8)
     run = simulate([own], motion=avoiding(avoid)).isel(run=0)
     assert run["failure"].item() == "" and float(run["y"].max()) > 6.0
     assert np.hypot(float(run["x"].dropna("time")[-1]) - 4.0, float(run["y"].dropna("time")[-1]) + 0.4) < 0.1
@@ -331,14 +327,18 @@ def test_shorter(avoid: Avoid) -> None:
 
 
 @pytest.mark.parametrize("avoid", ["barrier", "window", "mppi"])
-def test_several_missions(avoid: Avoid) -> None:
-    """Robots in different worlds, with different goals, maps and speeds, drive in one batch as each drives alone."""
+def test_several_missions(avoid: Avoid, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Robots in different worlds, with different goals, maps and speeds, drive in one batch as each drives alone.
+
+    A disc crosses the way of each. How many roll-outs the mean is taken of does not matter here.
+    """
+    monkeypatch.setattr("mrctl.navigation.mppi.SAMPLES", 400)
     drives = []
-    for side, end, speed in ((1, 3.0, 0.8), (-1, 2.6, 0.5)):
+    for side, end, speed in ((1, 4.0, 0.8), (-1, 3.6, 0.5)):
         known = Obstacles(shapes=(Box(x=1.4, y=0.7 * side, length=0.3, width=0.6), Disc(x=1.0, y=-1.2 * side)))
         unknown = Disc(x=2.0, y=-0.1 * side, radius=0.12)
-        world = Obstacles(shapes=(*known.shapes, unknown))
-        task = Task(obstacles=world, map=known, start=(0.0, 0.0, 0.0), goal=(end + 1, 0.3 * side, 0.0))
+        world = Obstacles(shapes=(*known.shapes, unknown, crossing(0.3, side)))
+        task = Task(obstacles=world, map=known, start=(0.0, 0.0, 0.0), goal=(end, 0.3 * side, 0.0))
         drives.append(prepared(task, PLANNED, speed, avoid=avoid)[1])
     assert len(uniform([arranged(own) for own in drives])) == 1
     together = simulate(drives, motion=avoiding(avoid))
