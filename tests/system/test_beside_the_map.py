@@ -88,10 +88,10 @@ def driven(world: str, robot: str, avoid: Avoid, count: int) -> tuple[Counter[st
     return found, times
 
 
-def cases(few: list[tuple[str, Avoid]], avoiders: tuple[Avoid, ...], count: int) -> list:
-    """Returns a few cases of two worlds, and all of `count` worlds for `pytest -m full -s`."""
+def cases(few: list[tuple[str, Avoid]], avoiders: tuple[Avoid, ...], count: int, usual: int = 2) -> list:
+    """Returns a few cases of the `usual` number of worlds, and all of `count` worlds for `pytest -m full -s`."""
     every = [pytest.param(robot, avoid, count, marks=pytest.mark.full) for robot in ROBOTS for avoid in avoiders]
-    return [*((*case, 2) for case in few), *every]
+    return [*((*case, usual) for case in few), *every]
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,8 @@ def test_still(robot: str, avoid: Avoid, count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("robot", "avoid", "count"), cases([("car", "barrier"), ("racecar", "window"), ("racecar", "mppi")], AVOIDERS, 24)
+    ("robot", "avoid", "count"),
+    cases([("car", "barrier"), ("racecar", "window"), ("racecar", "mppi")], AVOIDERS, 24, 1),
 )
 def test_walled(robot: str, avoid: Avoid, count: int) -> None:
     """Every robot sees from afar that the wall blocks its plan, and goes around it."""
