@@ -61,7 +61,7 @@ def test_scans_that_show_nothing():
     assert not np.isfinite(result["fix_x"]).any()
     error = np.hypot(result["x_measured"] - result["x"], result["y_measured"] - result["y"])[:, -1]
     deviation = np.sqrt(result["variance_x"] + result["variance_y"])[:, -1]
-    assert (error / deviation).max() < 4 and error[:4].max() > 0.02 and error[4:].max() > 0.02
+    assert (error / deviation).max() < 2.5 and error[:4].max() > 0.02 and error[4:].max() > 0.02
 
 
 class Listener:
