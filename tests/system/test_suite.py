@@ -3,17 +3,14 @@
 import base64
 import io
 import json
-import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +32,8 @@ from mrctl.viewer.recording import Library
 
 pytestmark = pytest.mark.xdist_group("suite")  # what its tests share is made once
 
-LAP = 4.0
+LAP = 2.5
+COURSE = mrctl.Circle(radius=0.3, period=LAP)
 GAIN = """
 class Gain:
     def __init__(self, robot, size):
@@ -53,9 +51,9 @@ class Gain:
 WINDOWS = {"first": lambda e: e[:, 0], "all": lambda e: np.sqrt(np.mean(e**2, axis=1))}
 
 
-def tiny(mode: str, seeds: int, random: int) -> list[Case]:
+def tiny(mode: str, seeds: int, random: int, course: mrctl.Circle = COURSE) -> list[Case]:
     """A case of each part, on a small circle."""
-    base = mrctl.Scenario(laps=2, reference=mrctl.Circle(radius=0.5, period=LAP))
+    base = mrctl.Scenario(laps=2, reference=course)
     payload = mrctl.Event(time=2 * LAP, perturbation=mrctl.PERTURBATIONS["payload ahead"])
     back = mrctl.Event(time=4 * LAP, perturbation=mrctl.Perturbation())
     off, on = mrctl.Event(time=0, learning=False), mrctl.Event(time=LAP, learning=True)
@@ -91,6 +89,17 @@ def small(here_throughout: None) -> Iterator[None]:
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures take seconds."""
     monkeypatch.setattr(report, "figures", lambda *_: {})
+
+
+def short(*of: Any, course: mrctl.Circle = COURSE) -> list[Case]:
+    """Two of the cases, for tests of what all share."""
+    return [case for case in tiny(*of, course=course) if case.name in ("nominal", "all")]
+
+
+@pytest.fixture
+def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A suite of two cases."""
+    monkeypatch.setattr(suite, "cases", short)
 
 
 def arguments(out: Path, *more: object) -> list[str]:
@@ -131,10 +140,10 @@ def test_table(whole: Path) -> None:
     cases = {case.name: case.scenarios for case in tiny("core", 2, 3)}
     found = {(row["case"], row["feedforward"]): row for row in table["rows"]}
     for case in ("all", "caster", "random"):
-        alone = {
-            name: mrctl.summary(mrctl.simulate([s.model_copy(update=mrctl.FEEDFORWARDS[name]) for s in cases[case]]))
-            for name in ("none", "rls")
-        }
+        alone, by_lap = {}, {}
+        for name in ("none", "rls"):
+            runs = mrctl.simulate([s.model_copy(update=mrctl.FEEDFORWARDS[name]) for s in cases[case]])
+            alone[name], by_lap[name] = mrctl.summary(runs), mrctl.per_lap(runs).position_rmse.values
         centre = np.median if case == "random" else np.mean
         row = found[case, "rls"]["omega_rmse"]
         own, bare = (alone[name]["omega_rmse"].to_numpy() for name in ("rls", "none"))
@@ -151,8 +160,7 @@ def test_table(whole: Path) -> None:
             assert found[case, "rls"]["position_rmse"]["laps_to_converge"]["value"] == pytest.approx(laps)
         for window, errors in WINDOWS.items():
             stated = found[case, "rls"]["position_rmse"][window]
-            laps = mrctl.per_lap(mrctl.simulate([s.model_copy(update=mrctl.FEEDFORWARDS["rls"]) for s in cases[case]]))
-            assert stated["value"] == pytest.approx(centre(errors(laps.position_rmse.values)), rel=1e-12)
+            assert stated["value"] == pytest.approx(centre(errors(by_lap["rls"])), rel=1e-12)
     assert (whole / "table.md").read_text().count("| rls ") == 13  # six cases twice, and the recovery
 
 
@@ -216,13 +224,15 @@ def test_all_runs_failed() -> None:
 
 
 @pytest.mark.usefixtures("plain")
-def test_hindsight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_hindsight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """The best fixed feedforward is that of `best_fixed`, and the regret of the model is what it does worse."""
+    chosen = partial(short, course=mrctl.Circle(radius=0.5, period=4))  # on COURSE the best fixed one is the model
+    monkeypatch.setattr(suite, "cases", chosen)
     words = ["suite", "--feedforward", "model", "hindsight", "--seeds", "1", "--random", "0", "--workers", "1"]
     assert cli.main([*words, "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "table.json").read_text())["rows"]
     all_laps = {r["feedforward"]: r["position_rmse"]["all"]["value"] for r in rows if r["case"] == "all"}
-    (scenario,) = next(case.scenarios for case in tiny("core", 1, 0) if case.name == "all")
+    (scenario,) = next(case.scenarios for case in chosen("core", 1, 0) if case.name == "all")
     laps = mrctl.per_lap(best_fixed([scenario])).position_rmse.values
     assert all_laps["hindsight"] == pytest.approx(np.sqrt(np.mean(laps**2)), rel=1e-9)
     (line,) = (
@@ -345,35 +355,34 @@ def test_no_worse() -> None:
     assert suite.no_worse(np.where(lost[::-1], np.nan, 3.0), pid)["quantile_99"] == 1.5
 
 
-def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupted in its second feedforward, it keeps what was done; continued by two workers, it writes the same files
-    as one that ran through, byte for byte, page and figures included.
-    """
-    out = tmp_path / "suite"
-    command = [sys.executable, __file__, *arguments(out, "--workers", 1)]
-    victim = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    done, second = out / "runs" / "none" / "runs.parquet", out / "runs" / "model" / "sweep.json"
-    while not second.exists() and victim.poll() is None:
-        time.sleep(0.01)
-    time.sleep(0.3)  # tqdm complains, at the very end, if it is interrupted while it makes a bar
-    os.kill(victim.pid, signal.SIGINT)
-    complaint = victim.communicate(timeout=60)[1]
-    assert victim.returncode == 130 and "mrctl: interrupted" in complaint.splitlines()[-1]
-    assert not (out / "report.html").exists()
-    stamp = done.stat().st_mtime_ns
-    monkeypatch.setattr(jobs, "Processes", Processes)
-    assert cli.main(arguments(out, "--workers", 2)) == 0
-    assert content(out) == content(whole) and done.stat().st_mtime_ns == stamp
-
-
-def held(path: str, job: int) -> JobOutcome:
-    """Computes a job, but the last one of the second feedforward is not done before it is interrupted."""
+def interrupted(path: str, job: int) -> JobOutcome:
+    """Computes a job, but Ctrl-C comes in the last one of the second feedforward."""
     if Path(path).name == "model" and job == Store(path).jobs - 1:
-        time.sleep(60)
+        signal.raise_signal(signal.SIGINT)
     return compute(path, job)
 
 
 compute = jobs.compute
+
+
+def test_goes_on_where_it_stopped(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Interrupted in its second feedforward, it keeps what was done; continued by two workers, it writes the same files
+    as one that ran through, byte for byte, page and figures included.
+    """
+    out = tmp_path / "suite"
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs, "compute", interrupted)
+        assert cli.main(arguments(out, "--workers", 1)) == 130
+    assert "mrctl: interrupted" in capsys.readouterr().err.splitlines()[-1]
+    assert not (out / "report.html").exists()
+    assert 0 < len(Store(out / "runs" / "model").done()) < Store(out / "runs" / "model").jobs
+    done = out / "runs" / "none" / "runs.parquet"
+    stamp = done.stat().st_mtime_ns
+    monkeypatch.setattr(jobs, "Processes", Processes)
+    assert cli.main(arguments(out, "--workers", 2)) == 0
+    assert content(out) == content(whole) and done.stat().st_mtime_ns == stamp
 
 
 class Page(HTMLParser):
@@ -465,6 +474,7 @@ def test_maps_are_those_of_feedforwards() -> None:
     assert report.with_map(choices) == ["fel", "model+rls", "Gain", "Both"]
 
 
+@pytest.mark.usefixtures("plain", "two_cases")
 def test_controller_with_the_model(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """With `model+` in front it adds to the nominal model, as with that prior in `simulate`; the page repeats that."""
     file, out = tmp_path / "mine.py", tmp_path / "suite"
@@ -503,7 +513,7 @@ def test_columns_say_what_they_are(whole: Path) -> None:
 
 def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A cell counts where the mean is no more than the rival's and the floor; each time it is driven is kept."""
-    monkeypatch.setattr(held_out, "courses", lambda: {"circle": mrctl.Circle(radius=0.5, period=LAP)})
+    monkeypatch.setattr(held_out, "courses", lambda: {"circle": COURSE})
     plants = {"heavy": mrctl.Perturbation(mass_factor=2.0), "light": mrctl.Perturbation(mass_factor=0.6)}
     monkeypatch.setattr(held_out, "PLANTS", plants)
     monkeypatch.setattr(held_out, "LAPS", 2)
@@ -534,6 +544,7 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         assert row["floor"]["difference"] >= max(changes) * (1 - 1e-9)
         assert row["at_or_below"] == (differences[1, row["plant"]] <= row["floor"]["difference"])
     (tmp_path / "mine.py").write_text(GAIN)
+    monkeypatch.setattr(held_out, "PLANTS", {"light": plants["light"]})
     own = [*words[:1], "--held-out", f"model+{tmp_path}/mine.py:Gain", *words[3:-1], str(tmp_path / "own")]
     assert cli.main(own) == 0
     assert "at or below model" in capsys.readouterr().out and (tmp_path / "own" / "runs" / "model+Gain").is_dir()
@@ -563,7 +574,7 @@ def test_bad_controller(tmp_path: Path, capsys: pytest.CaptureFixture, code: str
     assert not (tmp_path / "suite").exists()
 
 
-@pytest.mark.usefixtures("plain")
+@pytest.mark.usefixtures("plain", "two_cases")
 def test_controller_that_fails_later(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Its runs count as failed, and the tables say where and why."""
     late = GAIN.replace("self.ticks += 1", "self.ticks += 1\n        assert self.ticks < 50, 'tired'")
@@ -590,9 +601,3 @@ def test_bad_input(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -
     assert "begun with another" in refused(capsys, arguments(whole, "--seeds", 3))
     (tmp_path / "file").write_text("mine")
     assert "cannot be written" in refused(capsys, arguments(tmp_path / "file"))
-
-
-if __name__ == "__main__":
-    suite.cases = tiny
-    jobs.compute = held
-    sys.exit(cli.main())
