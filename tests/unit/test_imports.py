@@ -204,39 +204,33 @@ def test_global_callbacks() -> None:
         assert "mjcb" not in path.read_text(), path
 
 
-def loaded(code: str, suspects: tuple[str, ...]) -> list[str]:
-    """Which of some modules a fresh interpreter has loaded after running `code`, which must print nothing."""
-    code += f"\nimport sys; print(*[m for m in {suspects} if m in sys.modules])"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stderr == ""
-    return out.stdout.split()
+STEPS = (  # what a user does one after the other, and what is not loaded until then
+    ("import mrctl", ("numpy", "numba", "mujoco", "xarray", "torch")),
+    ("mrctl.Scenario(); mrctl.Sweep", ("numba", "mujoco", "dm_control", "torch", "scipy")),
+    (
+        "mrctl.Simulation, mrctl.simulate, mrctl.summary",
+        ("torch", "matplotlib", "scipy", "zarr", "tyro", "viser", "gymnasium", "dask", "mrctl.results.plots"),
+    ),
+    ("assert callable(mrctl.plots.save)", ()),
+)
 
 
 def test_light() -> None:
-    """`import mrctl` loads nothing heavy; a simulation loads neither torch nor figures, commands and viewer."""
-    assert not loaded("import mrctl", ("numpy", "numba", "mujoco", "xarray", "torch"))
-    assert not loaded(
-        "import mrctl; mrctl.Simulation, mrctl.simulate, mrctl.summary",
-        ("torch", "matplotlib", "scipy", "zarr", "tyro", "viser", "gymnasium", "dask"),
-    )
-
-
-def test_settings_are_data() -> None:
-    """A scenario is read where there is neither Numba, MuJoCo nor torch."""
-    code = "import mrctl; mrctl.Scenario(); mrctl.Sweep"
-    assert not loaded(code, ("numba", "mujoco", "dm_control", "torch", "scipy"))
+    """`import mrctl` loads nothing heavy, a scenario neither Numba, MuJoCo nor torch; a simulation loads neither torch
+    nor figures, commands and viewer; `mrctl.plots` is a module that is there before anything else has imported it.
+    """
+    look = "import sys; print({code!r}, *[m for m in {suspects} if m in sys.modules])"
+    code = "\n".join(f"{code}\n{look.format(code=code, suspects=suspects)}" for code, suspects in STEPS)
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (out.stdout.splitlines(), out.stderr) == ([code for code, _ in STEPS], "")
 
 
 def test_laws_without_physics() -> None:
     """The laws, the hierarchy and the results are usable where no engine is."""
-    block = "import sys; sys.modules['mujoco'] = sys.modules['dm_control'] = None\n"
-    loaded(block + "import mrctl.loop.hierarchy, mrctl.results.metrics, mrctl.results.dataset", ())
-
-
-def test_public_module() -> None:
-    """`mrctl.plots` is a module, which is there before anything else has imported it."""
-    script = "import mrctl; assert callable(mrctl.plots.save)"
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+    code = "import sys; sys.modules['mujoco'] = sys.modules['dm_control'] = None\n"
+    code += "import mrctl.loop.hierarchy, mrctl.results.metrics, mrctl.results.dataset"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (out.stdout, out.stderr) == ("", "")
 
 
 EVERY_MODULE = """

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mrctl
@@ -15,6 +15,7 @@ VALUES = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(results=st.lists(st.tuples(st.lists(st.text() | st.integers()), VALUES)), cut=st.integers(1, 60))
 def test_kept(results, cut, tmp_path_factory):
     """Another journal of the same file has the same results to the last bit, but for one whose line is torn."""
