@@ -165,9 +165,11 @@ def apart(poses: Array, weights: Array, most: int) -> NDArray[np.intp]:
 
 def within(poses: Array, pose: Array) -> NDArray[np.bool]:
     """Tells which poses are less than `SEED_DISTANCE` from another one in x, y and θ."""
-    away = np.abs(poses - pose)
-    away[:, 2] = np.abs(np.angle(np.exp(1j * away[:, 2])))
-    return np.all(away <= SEED_DISTANCE, axis=1)
+    x, y, heading = pose
+    near = (np.abs(poses[:, 0] - x) <= SEED_DISTANCE) & (np.abs(poses[:, 1] - y) <= SEED_DISTANCE)
+    turns = np.abs(poses[near, 2] - heading)  # of those near in place, which are few
+    near[near] = np.abs(np.angle(np.exp(1j * turns))) <= SEED_DISTANCE
+    return near
 
 
 @kernel
