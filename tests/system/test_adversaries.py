@@ -128,8 +128,7 @@ def scenario(steering, world, draw, **changes):
 
 
 def attack(steering, world, draws, laps, grow, kinds=KINDS):
-    """Returns which robots PID alone loses, `(draws,)`; the runs of all kinds and draws; and both, row by row."""
-    alone = simulate([scenario(steering, world, draw, laps=laps, prior="none") for draw in draws]).failed.values
+    """Returns the runs of all kinds and draws, and both, row by row."""
     rows = [(kind, k) for k in range(len(draws)) for kind in kinds]
     runs = simulate(
         [scenario(steering, world, draws[k], laps=laps) for _, k in rows],
@@ -137,11 +136,15 @@ def attack(steering, world, draws, laps, grow, kinds=KINDS):
             [kind for kind, _ in rows], [draws[k] for _, k in rows], robot, steering == "rigid", grow
         ),
     )
-    return alone, runs, rows
+    return runs, rows
 
 
-def check(alone, runs, rows):
+def check(steering, world, draws, laps, grow):
     """No robot is lost that PID alone keeps, and NaN is reported."""
+    runs, rows = attack(steering, world, draws, laps, grow)
+    alone = simulate([scenario(steering, world, draw, laps=laps, prior="none") for draw in draws]).failed.values
+    print(steering, world, "lost: PID alone", alone.sum(), "of", len(alone), "guarded", runs.failed.values.sum(),
+          "of", len(rows))  # fmt: skip
     lost = [(kind, k) for (kind, k), failed in zip(rows, runs.failed.values, strict=True) if failed and not alone[k]]
     assert not lost, lost
     broken = np.array([kind in ("NaN", "inf") for kind, _ in rows])
@@ -152,7 +155,7 @@ def check(alone, runs, rows):
 @pytest.mark.parametrize("steering", ARRANGEMENTS)
 def test_adversaries(steering):
     """A draw of each kind in the slow world of the paper, which is where robots are lost."""
-    check(*attack(steering, "paper", (2,), 2, (10, 20)))
+    check(steering, "paper", (4,), 1, (5, 10))
 
 
 @pytest.mark.full
@@ -160,19 +163,15 @@ def test_adversaries(steering):
 @pytest.mark.parametrize("steering", ARRANGEMENTS)
 def test_many_adversaries(steering, world):
     """Of 40 draws a third in each world, growing over 10 to 60 s."""
-    draws = tuple(range(WORLDS.index(world), 40, len(WORLDS)))
-    alone, runs, rows = attack(steering, world, draws, 4, (10, 60))
-    print(steering, world, "lost: PID alone", alone.sum(), "of", len(alone), "guarded", runs.failed.values.sum(),
-          "of", len(rows))  # fmt: skip
-    check(alone, runs, rows)
+    check(steering, world, tuple(range(WORLDS.index(world), 40, len(WORLDS))), 4, (10, 60))
 
 
 def test_one_breaks():
     """A batch with a row that breaks: that row is what it is alone, and the others are what they are without it."""
     kinds = "sine 0.3 Hz", "NaN", "steps"
-    _, runs, _ = attack("caster", "lab", (3,), 2, (10, 20), kinds)
+    runs, _ = attack("caster", "lab", (3,), 1, (5, 10), kinds)
     for k, kind in enumerate(kinds):
-        _, alone, _ = attack("caster", "lab", (3,), 2, (10, 20), (kind,))
+        alone, _ = attack("caster", "lab", (3,), 1, (5, 10), (kind,))
         for name in ("x", "y", "voltage_left", "feedforward_right", "guard"):
             assert np.array_equal(runs[name].values[k], alone[name].values[0]), (kind, name)
         assert runs.feedforward_fault[k].item() == alone.feedforward_fault[0].item()
@@ -209,7 +208,7 @@ def benign(tiers, names, draws, laps):
 
 def test_benign():
     """Learners in order, with little and much noise: the guard does nothing."""
-    assert benign(("ideal", "lab", "field"), ("nominal", "all"), (0,), 1) == (0.0, 0.0)
+    assert benign(("ideal", "field"), ("nominal", "all"), (0,), 1) == (0.0, 0.0)
 
 
 @pytest.mark.full
@@ -252,7 +251,7 @@ def test_guarantee(steering, world):
     The linear loops bound the posture error by ρ̄ and the position error by `recovery`; the limits on acceleration and
     the turns of the lemniscate add to them, most of all under rigid steering with the slow PID of the paper.
     """
-    base = scenario(steering, world, 0, laps=2, initial_spread=(0, 0, 0), learner="none")
+    base = scenario(steering, world, 0, laps=1, initial_spread=(0, 0, 0), learner="none")
     rigid, delay = steering == "rigid", base.sensing.periods("delay", PERIOD) * PERIOD
     _, robot = mjcf.build(base.world, steering, base.physics_step, base.robot)
     gains = base.pid.channels(robot, rigid, delay, PERIOD)
@@ -269,18 +268,18 @@ def test_guarantee(steering, world):
     bound = np.hypot(*recovery(robot, rigid, gains, loops, delay, corner))
     assert TOLERATED_POSTURE < bound < 0.3
 
-    def worst(shares, frequency, on):
-        class Worst(Adversary):
-            def __init__(self, nominal, size):
-                super().__init__(["bang-bang"] * size, range(size), nominal, rigid, (10, 20))
-                self.on = np.array(shares)[:, None] * within
-                self.size[:], self.begin[:], self.frequency[:] = 1.0, 1.0, frequency
+    frequencies, shares = np.array([0.15, 0.3, 1.0]), np.repeat([0.99, 3.0], 3)
 
-        return simulate([base.replace(guard={"on": on, "growth": 100.0})] * len(shares), feedforward=Worst)
+    class Worst(Adversary):
+        def __init__(self, nominal, size):
+            super().__init__(["bang-bang"] * size, [0, 1, 2] * 2, nominal, rigid, (10, 20))
+            self.on = shares[:, None] * within
+            self.size[:], self.begin[:], self.frequency[:] = 1.0, 1.0, np.tile(frequencies, 2)
 
-    frequencies = np.array([0.15, 0.3, 1.0])
-    calm = worst([0.99] * 3, frequencies, on=False)  # the guard ends oscillations
-    assert not calm.failed.any()
+    guards = [{"on": share > 1, "growth": 100.0} for share in shares]  # the guard ends oscillations
+    runs = simulate([base.replace(guard=guard) for guard in guards], feedforward=Worst)
+    assert not runs.failed.any()
+    calm, wild = runs.isel(run=slice(3)), runs.isel(run=slice(3, None))
     position = np.hypot(calm.x - calm.x_ref, calm.y - calm.y_ref)
     posture = np.hypot(position, HEADING_ARM * np.angle(np.exp(1j * (calm.theta - calm.theta_ref))))
     slack = 1.5 if (steering, world) == ("rigid", "paper") else 1.0
@@ -289,8 +288,6 @@ def test_guarantee(steering, world):
         velocity = np.stack([calm.v_command - calm.v, calm.omega_command - calm.omega], axis=-1)
         assert (np.abs(velocity).max(axis=(0, 1)) < 1.05 * region).all()
     assert position.values.max() < bound
-    wild = worst([3.0] * 3, frequencies, on=True)
-    assert not wild.failed.any()
     assert np.hypot(wild.x - wild.x_ref, wild.y - wild.y_ref).values.max() < 1.5 * bound
 
 
