@@ -18,11 +18,14 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def split(array: ArrayLike) -> Array:
     """Moves the last axis to the front, so that the components along it can be unpacked."""
-    return np.moveaxis(np.asarray(array, float), -1, 0)
+    found = np.asarray(array, float)
+    return found if found.ndim == 1 else np.moveaxis(found, -1, 0)
 
 
 def stack(*components: ArrayLike) -> Array:
     """Broadcasts components against each other and stacks them along a new last axis: the inverse of `split`."""
+    if all(np.ndim(one) == 0 for one in components):
+        return np.array(components)
     return np.stack(np.broadcast_arrays(*components), axis=-1)
 
 
