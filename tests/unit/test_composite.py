@@ -164,8 +164,8 @@ def drive(pupil, plant, seconds, disturbance=0.0, watch=None):
         if watch:
             watch(tick)
         log.append(feedback)
+        sides = left_right(voltage - disturbance)
         for _ in range(4):
-            sides = left_right(voltage - disturbance)
             twist = twist + PERIOD / 4 * accelerations(twist, sides, plant, sign_speed=0.05)
     pupil.driven = tick + 1, twist
     return np.array(log)

@@ -122,23 +122,29 @@ def allan(samples, period, lengths):
     return np.array([np.sqrt((d**2).mean() / 2) / (m * period) for d, m in zip(second, lengths, strict=True)])
 
 
-@pytest.mark.parametrize("rate", [0, 50])
-@pytest.mark.parametrize("name", ["gyro", "accelerometer"])
-def test_allan_deviation(name, rate):
+def test_allan_deviation():
     """The Allan deviation is N/√τ at short and K√(τ/3) at long averaging times, with slopes −½ and +½."""
-    density, walk, ticks = 1e-3, 3e-3, 50_000  # the two are equal at √3 N/K = 0.6 s
-    sensing = ideal(**{f"{name}_noise": density, f"{name}_walk": walk, f"{name}_rate": rate})
-    found = stream(sensing, ticks, range(48))
-    every = 2 if rate else 1
-    values = found["gyro"] if name == "gyro" else found["acceleration"].reshape(ticks, -1)
-    values, period = values[::every], every * PERIOD
-    for lengths, expected, slope in (
-        (np.array([1, 2, 3]), lambda tau: density / np.sqrt(tau), -0.5),
-        (np.array([6, 12, 20, 30]) * round(1 / period), lambda tau: walk * np.sqrt(tau / 3), 0.5),
-    ):
-        tau, deviation = lengths * period, allan(values, period, lengths)
-        np.testing.assert_allclose(deviation, expected(tau), rtol=0.1)
-        assert np.polyfit(np.log(tau), np.log(deviation), 1)[0] == pytest.approx(slope, rel=0.1)
+    density, walk, ticks, size = 1e-3, 3e-3, 50_000, 48  # the two are equal at √3 N/K = 0.6 s
+    noises = {f"{name}_{kind}": value for name in ("gyro", "accelerometer")
+              for kind, value in (("noise", density), ("walk", walk))}  # fmt: skip
+    rates = [ideal(**noises, gyro_rate=rate, accelerometer_rate=rate) for rate in (0, 50)]
+    sensors = Sensors([one for one in rates for _ in range(size)], [*range(size)] * 2, PERIOD)
+    plant, found = plants(2 * size), {"gyro": [], "acceleration": []}
+    for tick in range(ticks):
+        sensors.measure(tick, plant)
+        for name, log in found.items():
+            log.append(sensors.ring[tick % len(sensors.ring)][name].copy())
+    for log in found.values():
+        values = np.array(log).reshape(ticks, 2 * size, -1)
+        for every, rows in ((1, values[:, :size]), (2, values[::2, size:])):
+            rows, period = rows.reshape(len(rows), -1), every * PERIOD
+            for lengths, expected, slope in (
+                (np.array([1, 2, 3]), lambda tau: density / np.sqrt(tau), -0.5),
+                (np.array([6, 12, 20, 30]) * round(1 / period), lambda tau: walk * np.sqrt(tau / 3), 0.5),
+            ):
+                tau, deviation = lengths * period, allan(rows, period, lengths)
+                np.testing.assert_allclose(deviation, expected(tau), rtol=0.1)
+                assert np.polyfit(np.log(tau), np.log(deviation), 1)[0] == pytest.approx(slope, rel=0.1)
 
 
 def test_bias():
