@@ -1,5 +1,7 @@
 """T measured in the loop: the estimator on a known system, the physics against equation (3), and what T foretells."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -33,6 +35,12 @@ def scenarios(delays=(0.0,), **changes):
         )
         for d in delays
     ]
+
+
+@cache
+def designed(pid, delays, robot):
+    """The table of the design of a robot, which several tests read."""
+    return design("flat", pid, delays, RobotFile(path=robot))
 
 
 def on_paper(frequency, channel, delay, pid="normal"):
@@ -155,7 +163,7 @@ def test_refine():
 
 def test_twice_as_fast():
     """Half the λ is about twice the bandwidth and crossover on the physics too, and leaves every loop its margin."""
-    normal, fast = (design("flat", pid, (0.0,)) for pid in PIDS.values())
+    normal, fast = (designed(pid, (0.0,), "car") for pid in PIDS.values())
     for slow_loop, fast_loop in zip(normal["loops"], fast["loops"], strict=True):
         for name in ("bandwidth", "crossover"):
             ratio = fast_loop["measured"][name] / slow_loop["measured"][name]
@@ -169,7 +177,7 @@ def test_twice_as_fast():
 @pytest.mark.parametrize(("pid", "delays"), [(Pid(), (0.0, 0.01, 0.02)), (PIDS["normal"], (0.0,))])
 def test_designed_is_measured(robot, pid, delays):
     """On the physics every loop has the bandwidth that was designed to 10 %, and M_s, with every steering and delay."""
-    table = design("flat", pid, delays, RobotFile(path=robot))
+    table = designed(pid, delays, robot)
     assert len(table["loops"]) == len(delays) * (4 if robot == "car" else 2)
     for row in table["loops"]:
         wanted, found = row["design"], row["measured"]

@@ -1,7 +1,7 @@
 """A user's own stage replaces any of the four; an error in one is reported, and other runs are kept."""
 
 import re
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +124,12 @@ def same(one, other):
         assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), name
 
 
+@cache
+def built_in(*scenarios):
+    """Scenarios under the built-in laws, with which several tests compare."""
+    return simulate(scenarios)
+
+
 @pytest.mark.parametrize("steering", ["compliant", "rigid"])
 @pytest.mark.parametrize(
     "own",
@@ -138,7 +144,7 @@ def test_same_law(own, steering):
     own = dict(own or {"motion": Kanayama, "feedback": Feedback, "steering": Fork})
     if "feedback" in own:
         own["feedback"] = lambda robot, size: Feedback(robot, size, steering == "rigid")
-    builtin = simulate(scenarios)
+    builtin = built_in(*scenarios)
     assert float(builtin.saturated.sum()) > 0
     found = simulate(scenarios, **own)
     if steering == "rigid" and "steering" in own:  # the tangent at the limit is NumPy's there
@@ -335,7 +341,7 @@ def test_fault(stage, fault):
     other = SHORT.model_copy(update={"steering": "caster"})
     what, message = FAULTS[fault]
     whole = simulate([*THREE, other], **breaking(stage, what))
-    sound = simulate([*THREE, other])
+    sound = built_in(*THREE, other)
     tick = 99 if stage == "feedforward" else 100  # which is asked once before the first tick
     for run in range(3):
         text = str(whole.failure[run].item())
@@ -353,7 +359,7 @@ def test_fault(stage, fault):
 def test_not_finite(stage):
     """Not finite, with no guard: it stops the run of its row, whose failure names stage and tick, and no other run."""
     bare = [scenario.model_copy(update={"guard": mrctl.Guard(on=False)}) for scenario in THREE]
-    whole, sound = simulate(bare, **breaking(stage, spoilt)), simulate(bare)
+    whole, sound = simulate(bare, **breaking(stage, spoilt)), built_in(*bare)
     tick = 99 if stage == "feedforward" else 100
     assert str(whole.failure[1].item()) == f"{stage} Breaks: not finite, tick {tick}"
     assert whole.failed.values.tolist() == [False, True, False]
@@ -426,7 +432,7 @@ def test_inputs_are_copies():
             pose[:], twist[:], reference[:] = 1e9, 1e9, 1e9
             return answer
 
-    same(simulate(THREE, motion=Careless), simulate(THREE))
+    same(simulate(THREE, motion=Careless), built_in(*THREE))
 
 
 @pytest.mark.parametrize(
