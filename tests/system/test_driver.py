@@ -54,16 +54,16 @@ def test_least_squares_under_a_limit():
 @pytest.mark.parametrize("feedforward", ["none", "fel"])
 def test_hard_limit(feedforward):
     """A lap that needs 1.5 A with 1.3 A: who is told tracks twice as well in the end, and is left alone."""
-    untold, _ = limited(feedforward, 1.3, 12.0, 6, [0], told=False)
-    told, _ = limited(feedforward, 1.3, 12.0, 6, [0], told=True)
+    untold, _ = limited(feedforward, 1.3, 12.0, 3, [0], told=False)
+    told, _ = limited(feedforward, 1.3, 12.0, 3, [0], told=True)
     assert told < untold / 2
-    assert limited(feedforward, 1.3, 12.0, 6, [0], told=True, guard=True) == (told, 0)
+    assert limited(feedforward, 1.3, 12.0, 3, [0], told=True, guard=True) == (told, 0)
 
 
 def test_hard_limit_with_predictions():
     """`composite` need not be told: its error is the same within a tenth, and the guard leaves it alone."""
-    untold, _ = limited("model+composite", 1.3, 12.0, 6, [0], told=False)
-    told, guarded = limited("model+composite", 1.3, 12.0, 6, [0], told=True, guard=True)
+    untold, _ = limited("model+composite", 1.3, 12.0, 3, [0], told=False)
+    told, guarded = limited("model+composite", 1.3, 12.0, 3, [0], told=True, guard=True)
     assert told == pytest.approx(untold, rel=0.1) and told < 3.5
     assert guarded == 0
 

@@ -30,7 +30,7 @@ from mrctl.sensing.tiers import Sensing
 
 OFF = Guard(on=False)
 ERRORS = ("position_rmse", "v_rmse", "omega_rmse")
-DELAYED = Scenario(**IDEAL, reference=Lemniscate(period=12.0), laps=4, perturbation=Perturbation(control_delay=0.04))
+DELAYED = Scenario(**IDEAL, reference=Lemniscate(period=12.0), laps=3, perturbation=Perturbation(control_delay=0.04))
 LATE = DELAYED.model_copy(update={"perturbation": Perturbation(control_delay=0.06)})
 
 

@@ -28,7 +28,7 @@ OFF = Pid(retune=False)
 def late(**changes):
     """A figure of eight whose motors act 30 ms later than the controller knows."""
     settings = {"sensing": Sensing(tier="ideal"), "perturbation": Perturbation(control_delay=LATE), "learner": "none"}
-    return Scenario(reference=Lemniscate(period=12.0), laps=3, **settings | changes)
+    return Scenario(reference=Lemniscate(period=12.0), **{"laps": 2} | settings | changes)
 
 
 @pytest.mark.parametrize("learner", ["none", "fel", "composite"])
@@ -61,10 +61,10 @@ def test_the_loop_in_theory(robot):
 
 def test_a_delay_that_comes():
     """A delay in the middle of a run; `mrctl run` says when and what was done."""
-    event = Event(time=12.0, perturbation=Perturbation(control_delay=LATE))
-    scenario = late(perturbation=Perturbation(), events=(event,))
+    event = Event(time=3.0, perturbation=Perturbation(control_delay=LATE))
+    scenario = late(perturbation=Perturbation(), events=(event,), laps=1)
     moves = simulate([scenario])["retunes"].values[0]
-    assert (moves[:1200] == 0).all() and moves[-1] > 1
+    assert (moves[:300] == 0).all() and moves[-1] > 1
     text, *_ = single.run(scenario, None, False)
     first, second = (0.01 * np.flatnonzero(moves >= count)[0] for count in (1, 2))
     assert f"oscillation at {first:.2f} s: slower motion controller from now on" in text
@@ -95,7 +95,7 @@ def test_calm_loops_are_left_alone(tier, steering):
     reference = Circle(radius=1.0, period=8.0)
     cases = [Perturbation(), Perturbation(mass_factor=1.5, drive_friction_factor=1.5, supply_factor=0.9)]
     runs = [
-        Scenario(reference=reference, laps=2, steering=steering, sensing=Sensing(tier=tier), perturbation=p, pid=pid)
+        Scenario(reference=reference, laps=1, steering=steering, sensing=Sensing(tier=tier), perturbation=p, pid=pid)
         for p in cases for pid in (Pid(), OFF)
     ]  # fmt: skip
     result = simulate(runs)
@@ -105,25 +105,26 @@ def test_calm_loops_are_left_alone(tier, steering):
 
 
 @pytest.mark.parametrize("world", ["doorway:3", "doorway:8", "doorway:12", "cellular:6", "cellular:30"])
-@pytest.mark.parametrize("learner", ["none", "fel"])
-def test_planned_ways_are_no_oscillation(world, learner):
+def test_planned_ways_are_no_oscillation(world):
     """Splines at the limits of the robot, whose half-waves are as short as those of an oscillation, slow down nobody.
 
     Neither the nominal robot nor one that needs far more voltage than the nominal one.
     """
     heavy = Perturbation(mass_factor=1.5, resistance_factor=1.3, drive_friction_factor=1.5)
-    for perturbation in (Perturbation(), heavy):
-        scenario = Scenario(learner=learner, perturbation=perturbation)
-        result = simulate([prepared(task_of(world, scenario), scenario)[1]])
-        assert np.nanmax(result["retunes"].values) == 0
+    _, planned = prepared(task_of(world, Scenario()), Scenario())
+    result = simulate([
+        planned.replace(learner=learner, perturbation=p) for learner in ("none", "fel") for p in (Perturbation(), heavy)
+    ])  # fmt: skip
+    assert not result["failed"].any()
+    assert (np.nanmax(result["retunes"].values, axis=1) == 0).all()
 
 
-@pytest.mark.parametrize(("name", "steering"), [("turtlebot", "caster"), ("racecar", "rigid")])
-def test_other_robots(name, steering):
+@pytest.mark.parametrize(("name", "steering", "radius"), [("turtlebot", "caster", 0.8), ("racecar", "rigid", 1.5)])
+def test_other_robots(name, steering, radius):
     """The other robots with 30 ms of unknown delay: nobody oscillates in the last lap."""
     file = RobotFile(path=name)
     speed = 0.3 * read_robot(mjcf.load(steering=steering, robot=file)).max_speed
-    reference = Circle(radius=2.0, period=2 * np.pi * 2.0 / speed)
+    reference = Circle(radius=radius, period=2 * np.pi * radius / speed)
     result = simulate([
         Scenario(
             robot=file, steering=steering, reference=reference, laps=2, learner=learner, sensing=Sensing(tier="ideal"),

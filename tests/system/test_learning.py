@@ -6,7 +6,7 @@ import pytest
 from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights
 from mrctl.control.weights import initial_weights, unflatten
 from mrctl.experiments.paper import IDEAL
-from mrctl.loop.simulation import simulate
+from mrctl.loop.simulation import Simulation, simulate
 
 pytestmark = pytest.mark.xdist_group("learning")  # what its tests share is made once
 
@@ -115,9 +115,12 @@ def test_torch_module(runs):
     start = unflatten(initial_weights(24, BASE.seed))
     twin.load_state_dict({name: torch.tensor(layer) for name, layer in start.items()})
     short = variant(laps=1)
-    same = simulate(short, feedforward=lambda robot, size: ModuleLearning(twin, robot, size, BASE.fel))
-    for name in ("x", "omega", "feedforward_left"):
-        assert np.allclose(same[name], lap(runs.isel(run=0), 0)[name], atol=1e-6), name
+    same = Simulation([short], feedforward=lambda robot, size: ModuleLearning(twin, robot, size, BASE.fel))
+    for tick in range(400):
+        same.step()
+        found, expected = same.log.at(tick)[0], runs.isel(run=0, time=tick)
+        for name in ("x", "omega", "feedforward_left"):
+            assert np.allclose(found[name], expected[name], atol=1e-6), (name, tick)
 
     torch.manual_seed(0)
     own = torch.nn.Sequential(torch.nn.Linear(8, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))

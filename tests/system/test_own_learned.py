@@ -120,7 +120,7 @@ def test_module(tmp_path):
 
     torch.manual_seed(0)
     first = Simulation([BASE.model_copy(update={"laps": 1})], feedforward=module)
-    while first.running:
+    for _ in range(300):
         first.step()
     mrctl.save_learned(tmp_path / "module.safetensors", first.result().assign_attrs(scenarios=scenarios(BASE)))
     kept = BASE.model_copy(update={"learned": str(tmp_path / "module.safetensors")})
