@@ -24,7 +24,7 @@ def split(array: ArrayLike) -> Array:
 
 def stack(*components: ArrayLike) -> Array:
     """Broadcasts components against each other and stacks them along a new last axis: the inverse of `split`."""
-    if all(np.ndim(one) == 0 for one in components):
+    if not any(map(np.ndim, components)):
         return np.array(components)
     return np.stack(np.broadcast_arrays(*components), axis=-1)
 
