@@ -49,6 +49,21 @@ def result():
     return simulate(SCENARIOS)
 
 
+@pytest.fixture(scope="module")
+def small(result):
+    """One of its variables, where only folders and files matter."""
+    return result[["x"]]
+
+
+@pytest.fixture(scope="module")
+def saved(result, tmp_path_factory):
+    """The folders of all runs and of the first alone."""
+    folder = tmp_path_factory.mktemp("results") / "new"
+    save(result, folder / "all.zarr")
+    save(result.isel(run=0), folder / "one.zarr")
+    return folder / "all.zarr", folder / "one.zarr"
+
+
 def test_labels(result):
     """Dimensions, units, coordinates and attributes that everything else relies on."""
     assert result.sizes == {"run": 3, "time": 500, "weight": 80, "feature": 8, "channel": 2}
@@ -103,34 +118,31 @@ def test_meaning(result):
 
 
 @pytest.mark.parametrize("single", [False, True])
-def test_round_trip(result, single, tmp_path):
+def test_round_trip(result, saved, single, tmp_path):
     """Values to the bit, texts, coordinates, attributes; a single run too, and once more from what was opened."""
     result = result.isel(run=0) if single else result
-    save(result, tmp_path / "new" / "a.zarr")
-    opened = mrctl.open(tmp_path / "new" / "a.zarr")
+    opened = mrctl.open(saved[single])
     assert opened.identical(result)
     for name in SIGNALS:
         assert np.array_equal(opened[name], result[name], equal_nan=True)
     assert opened.attrs == result.attrs and list(np.atleast_1d(opened.label)) == list(np.atleast_1d(result.label))
     save(opened, str(tmp_path / "b.zarr"))
     assert open_result(str(tmp_path / "b.zarr")).identical(result)
-    assert sorted(p.name for p in tmp_path.rglob("*.partial")) == []
+    assert sorted(p.name for p in [*tmp_path.rglob("*.partial"), *saved[0].parent.rglob("*.partial")]) == []
 
 
-def test_single_run_in_the_viewer(result, tmp_path):
+def test_single_run_in_the_viewer(result, saved, tmp_path):
     """The viewer opens the saved result of one scenario, whose label and seed have no dimension, like that of many."""
-    save(result.isel(run=0), tmp_path / "one")
     save(result.isel(run=[0]), tmp_path / "list")
-    one, listed = Library(tmp_path / "one"), Library(tmp_path / "list")
+    one, listed = Library(saved[True]), Library(tmp_path / "list")
     pd.testing.assert_frame_equal(one.table, listed.table, check_dtype=False)
     assert one.recording(0).label == "gelernt ✓" and one.recording(0).scenario == SCENARIOS[0]
     assert one.recording(0).log.tobytes() == listed.recording(0).log.tobytes()
 
 
-def test_run_again(result, tmp_path):
+def test_run_again(result, saved):
     """A run is a pure function of its scenario: from the file, every bit again."""
-    save(result, tmp_path / "a")
-    again = scenarios_of(open_result(tmp_path / "a"))
+    again = scenarios_of(open_result(saved[False]))
     assert again == SCENARIOS
     assert simulate(again).identical(result)
 
@@ -174,49 +186,49 @@ def refused(message: str, call, *arguments) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_no_overwriting(result, tmp_path):
+def test_no_overwriting(small, tmp_path):
     """Not a result, not a file, not an empty folder."""
-    save(result, tmp_path / "a")
+    save(small, tmp_path / "a")
     (tmp_path / "b").write_text("mine")
     (tmp_path / "c").mkdir()
     for name in "abc":
-        refused(f"{name}: exists already", save, result.isel(run=0), tmp_path / name)
-    refused(r"d.nc: .*to_netcdf", save, result, tmp_path / "d.nc")
-    assert open_result(tmp_path / "a").identical(result)
+        refused(f"{name}: exists already", save, small.isel(run=0), tmp_path / name)
+    refused(r"d.nc: .*to_netcdf", save, small, tmp_path / "d.nc")
+    assert open_result(tmp_path / "a").identical(small)
     assert (tmp_path / "b").read_text() == "mine" and not list((tmp_path / "c").iterdir())
 
 
-def test_stale_partial(result, tmp_path):
+def test_stale_partial(small, tmp_path):
     """What a killed run left half written is no obstacle, and no part of the result."""
     (tmp_path / "a.partial").mkdir()
     (tmp_path / "a.partial" / "rubbish").write_text("")
-    save(result, tmp_path / "a")
-    assert open_result(tmp_path / "a").identical(result) and not (tmp_path / "a" / "rubbish").exists()
+    save(small, tmp_path / "a")
+    assert open_result(tmp_path / "a").identical(small) and not (tmp_path / "a" / "rubbish").exists()
 
 
-def test_what_cannot_be_opened_is_not_saved(result, tmp_path):
+def test_what_cannot_be_opened_is_not_saved(small, tmp_path):
     """An opened sweep has no scenarios; a copy of it that `open` refuses would be lost."""
-    sweep = result.drop_attrs().assign_attrs({name: result.attrs[name] for name in ("versions", "control_period")})
+    sweep = small.drop_attrs().assign_attrs({name: small.attrs[name] for name in ("versions", "control_period")})
     refused("result: lacks the attribute scenarios", save, sweep, tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
-def test_not_a_folder(result, tmp_path):
+def test_not_a_folder(small, tmp_path):
     """A file where the folder should be."""
     (tmp_path / "file").write_text("")
-    refused("cannot be written", save, result, tmp_path / "file" / "a")
+    refused("cannot be written", save, small, tmp_path / "file" / "a")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_read_only(result, tmp_path):
+def test_read_only(small, tmp_path):
     """A folder without permission."""
     tmp_path.chmod(0o500)
-    refused("cannot be written: Permission denied", save, result, tmp_path / "a")
+    refused("cannot be written: Permission denied", save, small, tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
-def test_disk_full(result, tmp_path, monkeypatch):
+def test_disk_full(small, tmp_path, monkeypatch):
     """Nothing is left behind when writing fails in the middle."""
     write = xr.Dataset.to_zarr
 
@@ -225,16 +237,16 @@ def test_disk_full(result, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(xr.Dataset, "to_zarr", fail)
-    refused("a: cannot be written: No space left on device", save, result, tmp_path / "a")
+    refused("a: cannot be written: No space left on device", save, small, tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
-def test_open_nothing(result, tmp_path):
+def test_open_nothing(small, tmp_path):
     """Neither a missing path, nor an empty folder, a file, another store, or a broken one."""
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("hello")
-    result[["x"]].drop_attrs().to_zarr(tmp_path / "other", zarr_format=3, consolidated=False)
-    save(result, tmp_path / "broken")
+    small.drop_attrs().to_zarr(tmp_path / "other", zarr_format=3, consolidated=False)
+    save(small, tmp_path / "broken")
     (tmp_path / "broken" / "zarr.json").write_text("{")
     for name in ("missing", "empty", "file", "other", "broken"):
         refused(f"{name}: not a saved result", open_result, tmp_path / name)
