@@ -111,24 +111,26 @@ def test_torch_module(runs):
     torch = pytest.importorskip("torch")
     from mrctl.control.fel_torch import ModuleLearning, Network
 
+    def begun(scenarios, module, ticks):
+        """The first ticks of runs that a module learns in."""
+        stage = lambda robot, size: ModuleLearning(module, robot, size, BASE.fel)  # noqa: E731
+        simulation = Simulation(scenarios, feedforward=stage)
+        for _ in range(ticks):
+            simulation.step()
+        return simulation.result().isel(time=slice(ticks))
+
     twin = Network()
     start = unflatten(initial_weights(24, BASE.seed))
     twin.load_state_dict({name: torch.tensor(layer) for name, layer in start.items()})
-    short = variant(laps=1)
-    same = Simulation([short], feedforward=lambda robot, size: ModuleLearning(twin, robot, size, BASE.fel))
-    for tick in range(400):
-        same.step()
-        found, expected = same.log.at(tick)[0], runs.isel(run=0, time=tick)
-        for name in ("x", "omega", "feedforward_left"):
-            assert np.allclose(found[name], expected[name], atol=1e-6), (name, tick)
+    start = begun([BASE], twin, 400)
+    for name in ("x", "omega", "feedforward_left"):
+        assert np.allclose(start[name][0], runs[name][0, :400], atol=1e-6), name
 
     torch.manual_seed(0)
     own = torch.nn.Sequential(torch.nn.Linear(8, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
-    learned = simulate(
-        [short, variant(laps=1, seed=1)], feedforward=lambda robot, size: ModuleLearning(own, robot, size, BASE.fel)
-    )
+    learned = begun([BASE, variant(seed=1)], own, 600)
     assert not learned.failed.any() and float(learned.weight_norm[0, -1]) > 0
-    assert rms(learned.feedback_left[0, TICKS // 2 :]) < rms(lap(runs.isel(run=1), 0).feedback_left[TICKS // 2 :])
+    assert rms(learned.feedback_left[0, 300:]) < rms(runs.feedback_left[1, 300:600])
 
 
 def test_too_small_a_bound():
