@@ -82,9 +82,13 @@ def test_other_course_begins_where_the_lap_ends():
                 np.testing.assert_allclose(begins, ends, atol=0.01)
 
 
-def test_random_scenario_is_a_function_of_its_seed(robot):
+@pytest.fixture(scope="module")
+def many():
+    return cases.random_scenarios(40)
+
+
+def test_random_scenario_is_a_function_of_its_seed(robot, many):
     """The same again, also among others; different for another seed; every kind of perturbation comes up."""
-    many = cases.random_scenarios(40)
     assert sorted(s.seed for s in many) == list(range(40)) and cases.random_scenario(17, robot) in many
     assert len({s.reference for s in many}) == 40
     assert {s.name.split(": ")[1] for s in many} == set(cases._KINDS)
@@ -93,13 +97,13 @@ def test_random_scenario_is_a_function_of_its_seed(robot):
     assert Scenario.from_dict(many[0].model_dump(mode="json")) == many[0]
 
 
-def test_random_robots_can_follow_and_stand(robot):
+def test_random_robots_can_follow_and_stand(robot, many):
     """Each reference changes its speed, keeps its margin, and has a lap time of the list; no payload tips the robot."""
     limits = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
     careful = {name: 1.01 * cases.SPLINE_LIMIT_SHARE * getattr(robot, name) for name in limits}
     careful = robot.model_copy(update={**careful, "tyre_friction": 1.01 * cases.RELIED_FRICTION})
     nominal, spread = mjcf.load(), []
-    for scenario in cases.random_scenarios(12):
+    for scenario in many[:12]:
         course = scenario.reference
         check(course, careful, reverse=False)
         assert min(abs(course.period - time) for time in cases.LAP_TIMES) < 1e-9

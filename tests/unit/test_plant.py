@@ -308,7 +308,8 @@ def test_inductance_in_the_loop(inductive):
         Scenario(world=world, reference=Circle(period=4, radius=0.5), laps=1, prior="model", learner="none", seed=seed)
         for seed, world in ((0, inductive), (1, inductive), (0, "flat"))
     ]
-    with_winding, _, without = (simulate(scenarios).isel(run=run) for run in range(3))
+    runs = simulate(scenarios)
+    with_winding, _, without = (runs.isel(run=run) for run in range(3))
     assert np.array_equal(with_winding.current_left, simulate(scenarios[0]).current_left)
     assert not with_winding.failed and not np.array_equal(with_winding.v, without.v)
     assert np.abs(with_winding.v - without.v).max() < 0.01

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -59,6 +59,7 @@ def numbers(shape, bound):
     return arrays(float, shape, elements=st.floats(-bound, bound))
 
 
+@settings(max_examples=30)  # of 6 s each
 @given(st.floats(0.1, 1.5), st.floats(-3, 3))
 def test_steady_turn(robot, v, omega):
     """In a steady turn the fork settles where its wheel rolls without scrub."""
