@@ -12,7 +12,7 @@ from mrctl.loop.simulation import Simulation
 
 COURSE, OTHER = Lemniscate(size=1.2, period=10), Circle(radius=0.8, period=8)
 BASE = Scenario(
-    sensing=Sensing(tier="ideal"), perturbation=PERTURBATIONS["all"], reference=COURSE, laps=2, initial_spread=(0, 0, 0)
+    sensing=Sensing(tier="ideal"), perturbation=PERTURBATIONS["all"], reference=COURSE, laps=1, initial_spread=(0, 0, 0)
 )
 FROZEN = (Event(time=0.0, learning=False),)
 LEARNERS = ("fel", "model+fel", "model+rls", "model+mrac", "model+composite", "model+observer", "model+l1")
@@ -33,7 +33,7 @@ class Still:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A file of what each learner has adapted in two laps."""
+    """A file of what each learner has adapted in a lap."""
     folder = tmp_path_factory.mktemp("learned")
     runs = mrctl.simulate([BASE.model_copy(update=FEEDFORWARDS[name]) for name in LEARNERS])
     for k, name in enumerate(LEARNERS):
@@ -58,7 +58,7 @@ def test_starts_where_it_ended(name, files):
 
 def test_beside_another_feedforward(files):
     """What `compare` adds, and the best fixed feedforward, have nothing to do with what the first learner kept."""
-    first = BASE.model_copy(update={"learner": "fel", "learned": files["fel"][0], "laps": 1, "name": "first"})
+    first = BASE.model_copy(update={"learner": "fel", "learned": files["fel"][0], "name": "first"})
     for name in ("none", "model+rls", "fel"):
         other = first.with_feedforward(name)
         assert (other.feedforward, other.learned, other.name) == (name, None, "")
@@ -73,7 +73,7 @@ def test_transfer(name, files):
     Not frozen, it begins as well and goes on learning.
     """
     pair = FEEDFORWARDS[name]
-    elsewhere = BASE.model_copy(update={**pair, "reference": OTHER, "laps": 1})
+    elsewhere = BASE.model_copy(update={**pair, "reference": OTHER})
     alone = elsewhere.model_copy(update={"learner": "none"})
     kept = elsewhere.model_copy(update={"learned": files[name][0]})
     frozen = kept.model_copy(update={"events": FROZEN})
@@ -95,7 +95,7 @@ def test_refused(files, tmp_path):
     with pytest.raises(InputError, match="^run: 2 runs; choose one"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
     with pytest.raises(InputError, match="^learned: no learner of the run keeps anything"):
-        mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none", "laps": 1})))
+        mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none"})))
     keeping = {name for name, law in learners.LEARNERS.items() if law.kept(Fel())}
     assert keeping == {"observer", "l1", "fel", "rls", "mrac", "composite"}
 
@@ -128,6 +128,6 @@ def test_other_voltages(files, tmp_path):
 
 def test_norm_of_what_was_learned(files):
     """A run that starts from coefficients and does not learn has their norm from its first tick on."""
-    update = {"learned": files["model+rls"][0], "events": FROZEN, "laps": 1}
+    update = {"learned": files["model+rls"][0], "events": FROZEN}
     run = mrctl.simulate(BASE.model_copy(update=FEEDFORWARDS["model+rls"] | update))
     assert np.allclose(run.weight_norm, np.linalg.norm(files["model+rls"][1].weights.values[:16]), rtol=1e-6)

@@ -229,7 +229,7 @@ def test_follow():
     for tier, preview in (("ideal", 0), ("field", 2)):
         Told.told = []
         events = [{"time": 0.5, "reference": Circle(radius=0.7, period=5)}, {"time": 0.8, "push": (1.0, 0, 0)}]
-        changes = {"sensing": {"tier": tier}, "initial_spread": (0.0, 0.0, 0.0)}
+        changes = {"sensing": {"tier": tier}, "initial_spread": (0.0, 0.0, 0.0), "reference": Line(length=1.0)}
         plain, other = (Scenario(laps=1, seed=k, **changes) for k in range(2))
         simulate([plain.replace(events=events), other], motion=Told)
         assert Told.told == [(50 - preview, 0, "circle")]
