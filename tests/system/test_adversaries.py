@@ -208,7 +208,7 @@ def benign(tiers, names, draws, laps):
 
 def test_benign():
     """Learners in order, with little and much noise: the guard does nothing."""
-    assert benign(("ideal", "field"), ("nominal", "all"), (0,), 1) == (0.0, 0.0)
+    assert benign(("ideal", "lab", "field"), ("nominal", "all"), (0,), 1) == (0.0, 0.0)
 
 
 @pytest.mark.full
