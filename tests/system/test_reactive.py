@@ -7,6 +7,7 @@ from test_batch_equals_single import equal
 import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario, simulate
 from mrctl.loop.simulation import arranged, uniform
+from mrctl.navigation import avoiders
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import navigate
@@ -155,12 +156,15 @@ def test_keeps_off(start: float) -> None:
 
 
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
-def test_slow(avoid: Avoid) -> None:
-    """A robot whose largest speed is 2 cm/s drives at about that speed, and is not taken for one that is stuck."""
+def test_slow(avoid: Avoid, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot whose largest speed is 2 cm/s drives at about that speed, and needs no other plan as one that waits."""
+    searches = []
+    monkeypatch.setattr(avoiders, "planned", lambda *query, **how: searches.append(query) or planned(*query, **how))
     task = Task(obstacles=Obstacles(shapes=(Disc(x=0.3, y=0.5),)), start=(0, 0, 0), goal=(0.22, 0.0, 0.0))
     driven = navigate(task, PLANNED, speed=0.02, avoid=avoid)
     (row,) = driven.table.itertuples()
     assert row.outcome == "arrived" and row.time < 1.3 * row.length / 0.02 and float(driven.result["v"].min()) > -0.01
+    assert not searches
 
 
 def test_control_period() -> None:
