@@ -30,8 +30,9 @@ def followed(scenario: Scenario, time: float) -> Reference:
 
 
 def begun(scenario: Scenario, time: float) -> float:
-    """Returns the time in s at which the reference began that a run follows at a time in s."""
-    return max((e.time for e in scenario.events if e.reference and e.time <= time + 1e-9), default=0.0)
+    """Returns the time in s of the control tick at which the reference began that a run follows at a time in s."""
+    period = scenario.control_period
+    return max((e.tick(period) * period for e in scenario.events if e.reference and e.time <= time + 1e-9), default=0.0)
 
 
 def ends(scenario: Scenario, time: float) -> Array | None:
