@@ -416,7 +416,9 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     index = np.where(lap > 0, lap - 1, counts + lap)
     there = (index >= 0) & (index < counts)
     if lap == 0 or not there.any():
-        raise InputError(f"lap: {lap} is not in 1 to {counts.max(initial=0):.0f}, nor counted from the end by −1, −2, …")
+        raise InputError(
+            f"lap: {lap} is not in 1 to {counts.max(initial=0):.0f}, nor counted from the end by −1, −2, …"
+        )
     rows = np.arange(len(counts))
     columns = {name: laps[name].values for name in PER_RUN[:-1] if name in laps.coords}
     columns |= {name: laps[name].values for name in ("laps", "failed", "failure_time")}
