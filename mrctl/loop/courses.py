@@ -40,8 +40,8 @@ def distinct_courses(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], NDA
     """Returns one scenario for each different course, and the index of the one that each robot follows, `(B,)`."""
     keys = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in scenarios]
     distinct = dict(zip(keys, scenarios, strict=True))
-    order = list(distinct)
-    return list(distinct.values()), np.array([order.index(key) for key in keys])
+    place = {key: k for k, key in enumerate(distinct)}
+    return list(distinct.values()), np.array([place[key] for key in keys])
 
 
 class Courses:
@@ -59,7 +59,7 @@ class Courses:
         """Returns the references at a control tick, and those at the time when the voltage of that tick acts.
 
         Returns:
-            Two times a record of `GOAL` of each robot, `(B,)`.
+            Two arrays with a record of `GOAL` of each robot, `(B,)`.
         """
         if tick != self._tick:
             self._tick, self._now = tick, self._sampled(tick)
@@ -120,14 +120,16 @@ def start_pose(scenario: Scenario, reference: Array) -> Array:
         reference: Pose of the reference at the start in m, m, rad, `(3,)`.
 
     Raises:
-        InputError: The initial pose is more than 0.8 m from the reference.
+        InputError: The initial pose is more than `MAX_START_DISTANCE` from the reference; the message names the field
+            that puts it there, the pose or the spread of the offset.
     """
     base = reference if scenario.initial_pose is None else np.array(scenario.initial_pose)
     offset = np.random.default_rng([scenario.seed, 0]).standard_normal(3) * scenario.initial_spread
     distance = float(np.hypot(*(base + offset - reference)[:2]))
     if distance > MAX_START_DISTANCE:
+        field = "initial_spread" if scenario.initial_pose is None else "initial_pose"
         raise InputError(
-            f"initial_pose: {distance:.2f} m from the start of the reference at "
+            f"{field}: {distance:.2f} m from the start of the reference at "
             f"({reference[0]:.2f}, {reference[1]:.2f}); at most {MAX_START_DISTANCE:g} m"
         )
     return base + offset

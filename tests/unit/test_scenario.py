@@ -239,6 +239,7 @@ FAR_AWAY = Waypoints(points=((8, 0), (10, 0), (9, 2)))
     [
         ("^world: no file", {"world": "moon"}),
         ("^initial_pose: 5.00 m from the start", {"initial_pose": (3.0, 4.0, 0.0)}),
+        ("^initial_spread: 0.89 m from the start", {"initial_spread": (0.2, 0.2, 0.0), "seed": 755}),
         ("^initial_pose: there is no ground", {"world": "rough", "reference": FAR_AWAY}),
         ("^reference line: speed 2 m/s .*max_speed", {"reference": Line(speed=2)}),
         ("^reference circle: rotation", {"reference": Circle(period=1.9, radius=0.2)}),
