@@ -302,6 +302,7 @@ class Simulation:
         self.goals = Goals(scenarios, timed=not restarting)
         self._failure_time = np.full(size, np.nan)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
+        self._final: dict[int, tuple[Array, Array]] = {}  # what `parameters` had where a run ended without failure
         self._sensed = False  # whether the coming tick is sensed
         self._start()
 
@@ -326,9 +327,8 @@ class Simulation:
         """Builds the physics; refuses perturbations of events, before anything is computed."""
         substeps = round(self.period / self.scenarios[0].physics_step)
         plant = build(models, robot, substeps, threads, [s.obstacles for s in self.scenarios])
-        later = [event.perturbation for scenario in self.scenarios for event in scenario.events]
-        for k, perturbation in enumerate(later):
-            if perturbation is not None and perturbation not in later[:k]:
+        for perturbation in {event.perturbation: None for scenario in self.scenarios for event in scenario.events}:
+            if perturbation is not None:
                 plant.check(perturbation)
         return plant
 
@@ -487,12 +487,16 @@ class Simulation:
         self._failure_time[row] = np.nan
         self.goals.restart(row, tick)
         self._learned.pop(row, None)
+        self._final.pop(row, None)
 
     def _end(self, tick: int) -> None:
         """Ends the runs that are at their goals, stuck or at their own end; the record of the tick is kept."""
         for row, reason in self.goals.ended(tick, self.log.now).items():
             if row in self._learned:
                 continue
+            if not reason and (coefficients := self.parameters()) is not None:
+                known, true = coefficients
+                self._final[row] = known[row], true[row]
             self.plant.fail(row, reason)
             self._keep_learned([row])
             if reason:
@@ -599,11 +603,13 @@ class Simulation:
         return {"clearance": (("run", "time"), found, attributes)}
 
     def parameters(self) -> tuple[Array, Array] | None:
-        """Returns the coefficients of the scaled features now: the sum of prior and learner, and the true ones.
+        """Returns the coefficients of the scaled features: the sum of prior and learner, and the true ones.
+
+        They are those of now or, where a run has ended without failure, those of its end.
 
         Returns:
-            Two arrays `(B, 8, 2)` in V, NaN where a robot has failed and where the second channel is steering; None
-            if the learner has no such coefficients.
+            Two arrays `(B, 8, 2)` in V, NaN where the second channel is steering, and the first also where a robot has
+            failed; None if the learner has no such coefficients.
         """
         hierarchy = self.hierarchy
         if (learned := hierarchy.learner.parameters) is None:
@@ -614,4 +620,6 @@ class Simulation:
         known[self.plant.failed] = np.nan
         if self.scenarios[0].steering == "rigid":  # the second channel is steering
             known[:, :, 1] = true[:, :, 1] = np.nan
+        for row, final in self._final.items():
+            known[row], true[row] = final
         return known, true

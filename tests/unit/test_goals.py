@@ -65,8 +65,10 @@ def test_what_was_learned_when_a_run_failed(learner):
 
 
 def test_what_was_learned_when_a_run_ended():
-    """A run that ends before its batch keeps the weights of its own end, as when it runs alone."""
+    """A run that ends before its batch keeps weights and coefficients of its own end, as when it runs alone."""
     short = TASK.replace(goal=(0.8, 0.0, 0.0), learner="rls", laps=1)
     long = short.replace(reference=Line(length=2.4), goal=(2.4, 0.0, 0.0))
     both, alone = simulate([short, long]), simulate(short)
     assert np.array_equal(both.weights[0], alone.weights) and not np.array_equal(both.weights[1], alone.weights)
+    for name in ("parameters", "true_parameters"):
+        assert np.isfinite(alone[name]).all() and np.array_equal(both[name][0], alone[name])
