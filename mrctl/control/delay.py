@@ -9,6 +9,9 @@ even moves differ:
    alone may oscillate because of them. So they give way first.
 2. The PID is designed for `DELAY_STEP` more delay too.
 
+A user's motion controller cannot be designed for more delay. Beside one, each oscillation is answered by two moves at
+once: they slow the PID and, as often as `LEARNER_MOVES` says, the learner.
+
 The next move follows after `FADING_TIME`, in which the oscillation may fade, or after `MIN_MOVE_INTERVAL` if the
 oscillation has grown by the factor `GROWTH`. The moves are not taken back during a run. To lower a gain on an
 oscillation is the idea of adaptive augmenting control (Orr and VanZwieten 2012, Robust, practical adaptive control for
@@ -50,7 +53,8 @@ channel), *chosen*."""
 FADING_TIME = 2.0
 """Least time in s between two moves while the oscillation does not grow, in which it may fade, *chosen*."""
 GROWTH = 2.0
-"""Factor by which an oscillation must have grown since the last move to be answered within the rest, *chosen*."""
+"""Factor by which an oscillation must have grown since the last move to be answered before `FADING_TIME` is over,
+*chosen*."""
 MIN_MOVE_INTERVAL = 0.5
 """Least time in s between two moves while the oscillation grows, *chosen*."""
 PEAK_DECAY = 1.0
