@@ -202,7 +202,7 @@ class Guard(Record):
     on: bool = True
     """Whether the guard watches the learner, and may replace it."""
     velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
-    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
+    """Largest errors of V and θ̇ with which a learner may go on, as a share of the robot's largest V and θ̇; at least
     0.27 m/s and 0.75 rad/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Share of D, by more than which the PID's output must swing, and the learner deviate from the fallback, for an
@@ -270,7 +270,8 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     Args:
         settings: Settings of each robot.
         robot: The nominal robot, as from `nominal`.
-        gains: Peak-to-peak gains from a voltage of each channel to its velocity error and to the position, `(B, 2, 2)`.
+        gains: Peak-to-peak gains from a voltage of each channel to its velocity error and to the posture error,
+            `(B, 2, 2)`.
     """
     rows = np.zeros(len(settings), GUARD)
     for name in ("on", "oscillation", "growth", "hold", "retries", "fade"):

@@ -1,4 +1,4 @@
-"""Sustained oscillations: half-waves of a voltage in a row, which the guard and the PID's delay both look for.
+"""Sustained oscillations: half-waves of a voltage in a row, which `guard` and `delay` both look for.
 
 The loops are designed with damping ratios of at least 0.5: after a push a half-wave has at most a sixth of the
 amplitude of the one before it. Many in a row are fed by something.

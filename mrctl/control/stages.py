@@ -138,15 +138,15 @@ class EstimatorStage(Protocol):
     """The estimator of posture and twist, which is called once in a control period.
 
     Its estimate is predicted to the time at which the voltage of the period acts. If the estimate of a robot is not
-    finite, odometry continues from its last estimate; `estimator_fault` of the result names the first
-    such tick.
+    finite, odometry continues from its last estimate; `estimator_fault` of the result names the first such tick.
     """
 
     def reset(self, pose: Array, twist: Array, period: float) -> None:
         """Starts a run.
 
         Args:
-            pose: First estimate of x and y in m and of θ in rad, with the errors of a fix, `(B, 3)`.
+            pose: First estimate of x and y in m and of θ in rad, `(B, 3)`; `start_position_noise` and
+                `start_heading_noise` of `sensing` are its errors, by default those of a fix.
             twist: First estimate of V in m/s and θ̇ in rad/s, `(B, 2)`.
             period: Control period, from one `output` to the next, in s.
         """

@@ -31,9 +31,11 @@ SEEN = np.dtype(
 def advance(
     x: float, y: float, theta: float, v: float, omega: float, v_dot: float, omega_dot: float, period: float
 ) -> tuple[float, float, float, float, float]:
-    """Integrates posture and twist over one period, with the second-order Runge-Kutta method.
+    """Integrates posture and twist over one period, to second order.
 
         ẋ = V cos θ,  ẏ = V sin θ,    V̇ and θ̈ given and constant
+
+    The position moves with the mean of V, in the direction that the robot has after half of its turn.
 
     Args:
         x: x in m.

@@ -15,7 +15,7 @@ MAX_OUTLIER = 1.0  # m, largest error of an outlying fix in x and y
 SENSOR = np.dtype(
     [
         ("quantum", "f8"),  # angle of one encoder count, rad; 0 for an exact encoder
-        ("phase", "f8", 2),  # angle of each encoder at which a count begins, in counts from 0 to 1
+        ("phase", "f8", 2),  # place within its count that each encoder has at the angle 0, in counts from 0 to 1
         ("encoder_every", "i8"),  # time from one encoder sample to the next, control periods
         ("encoder_latency", "i8"),  # age of an encoder sample at its arrival, control periods
         ("gyro_sigma", "f8"),  # standard deviation of the noise of a sample, rad/s
