@@ -79,7 +79,7 @@ def _name(law: Callable[..., Any]) -> str:
 
 @cache
 def announced() -> Announcement:
-    """Lets this process announce compilations; the workers of a sweep, one of many, stay silent."""
+    """Lets this process announce compilations, unless it is a worker of another process, as in a sweep."""
     announcement = Announcement()
     announcement.said = announced_early()
     if parent_process() is None:

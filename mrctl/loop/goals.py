@@ -109,6 +109,8 @@ class Goals:
     def ended(self, tick: int, now: Rows) -> dict[int, str]:
         """Returns the robots whose runs end, each with the reason of its failure: `stuck`, or "" where it did not fail.
 
+        A robot whose own ticks are done is among them in each tick from then on.
+
         Args:
             tick: The control tick.
             now: Record of `TICK` of each robot at this tick, `(B,)`; NaN for a robot whose run has ended.

@@ -50,8 +50,8 @@ CONTROL = np.dtype(
         ("limiter", LIMITER),
         ("pid", PID),
         ("feedback", "f8", 2),  # output of the PID, V (rad/s on a steering channel)
-        ("prior", "f8", 2),  # feedforward of the prior, V
-        ("feedforward", "f8", 2),  # that of prior and learner, V (rad/s on a steering channel)
+        ("prior", "f8", 2),  # scratch of `update`: feedforward of the prior, V
+        ("feedforward", "f8", 2),  # feedforward of prior and learner, V (rad/s on a steering channel)
         ("nominal", "f8", 2),  # output of the nominal inverse dynamics, if guard or delay watch is on, V (rad/s)
         ("delay", DELAY),
         ("guard", GUARD),
@@ -118,7 +118,7 @@ def apply_voltages(seen: Row, robot: Row, period: float, s: Row) -> bool:
 def hand_over(s: Row) -> None:
     """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `HAND_OVER_SHARE` · authority · added.
 
-    Where that is not finite, the guard replaces the learner in the next tick.
+    Where that is not finite, nothing is taken, and the guard, if it is on, replaces the learner in the next tick.
     """
     for k in range(2):
         if not np.isfinite(s.added[k]):

@@ -7,10 +7,10 @@ squares finds the coefficients that would have given this voltage, and the run i
 learning is frozen do not count. After one repetition the coefficients hardly change any more.
 
 Least squares makes the feedback voltage small and not the error, which grows where the loop oscillates with the
-coefficients found. Of the drives of a run, the first guess included, the one with the least position error over all
-laps is therefore taken, so that the model never has less than it. By analogy with on-line learning (Cesa-Bianchi and
-Lugosi, 2006), the regret of a learner is its RMS position error over all laps less that of this drive. It can be
-negative, because a learner is not fixed, and because another fixed feedforward may have less.
+coefficients found. Of the drives of a run, that with the nominal model included, the one with the least position error
+over all laps is therefore taken, so that the nominal model never has less error than it. By analogy with on-line
+learning (Cesa-Bianchi and Lugosi, 2006), the regret of a learner is its RMS position error over all laps less that of
+this drive. It can be negative, because a learner is not fixed, and because another fixed feedforward may have less.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
 
 
 def load_learned(scenario: Scenario) -> Array:
-    """Reads what the learner of a scenario starts from, flat, `(n,)`; warns if another robot has learned it.
+    """Reads what the learner of a scenario starts from, flat, `(n,)`; warns as `load_arrays`.
 
     Raises:
         InputError: As `load_arrays`.

@@ -22,7 +22,7 @@ def beyond(feedforward: Array, limits: Array, rigid: bool) -> bool:
 
 @kernel
 def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, rigid: bool, error: Array, ticks: Rows) -> bool:
-    """Writes the signals of one control tick of all robots; returns whether all are near their references.
+    """Writes the signals of one control tick of all robots; returns whether all that go on are near their references.
 
     A sample at time t has the state at t, the commands computed from it, and the currents and the power at the end of
     the control period that begins at t; the commands act after the delay.

@@ -19,7 +19,7 @@ from mrctl.theory.references import Reference
 from mrctl.theory.robot import Robot
 
 REPLACED = {"motion": ("k_x", "k_y", "k_theta"), "feedback": ("k_p", "k_i")}
-"""Gains of `GAIN_VARIABLES` that have no effect where the user has a stage of this name; a result has NaN for them."""
+"""Gains of `GAIN_VARIABLES` whose law a stage of the user with this name replaces; a result has NaN for them."""
 
 
 @kernel

@@ -51,8 +51,8 @@ def perturb(
     """Writes the nominal model, changed by a perturbation, into another model, and recomputes its constants.
 
     What an earlier perturbation changed in that model is undone. The rolling loss in a wheel's frictionloss grows with
-    the static load on the wheel. `limit_current` writes the current limit. A model has no
-    fields for the rest of the driver, the steering servo and delay, which `mrctl.physics.plant` applies.
+    the static load on the wheel. `limit_current` writes the current limit. A model has no fields for the rest of the
+    driver, for the steering servo and for delay, which `mrctl.physics.plant` applies.
 
     Args:
         nominal: The nominal model, which is only read.

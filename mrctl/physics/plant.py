@@ -1,8 +1,8 @@
 """The boundary to MuJoCo: one robot through dm_control, or many through `mujoco.batch`, behind one interface.
 
 Every array has a leading batch dimension. Both plants share all code but a few methods, so robot i of a batch gives the
-same bits as its scenario alone. The readouts use `qpos`, `qvel` and `act` only, because the sensor data of
-a batch is a substep old.
+same bits as its scenario alone. The readouts use `qpos`, `qvel` and `act` only, because the sensor data of a batch
+is a substep old.
 """
 
 # pyright: reportAttributeAccessIssue=false

@@ -1,8 +1,8 @@
 """Measures how the tyres of the nominal robot depart from rolling without slip, as one would on a test bench.
 
-MuJoCo's tyres are soft and creep a little, so the wheels do not turn by exactly the distance over the radius. A
-constant part, 0.05 % of the radius, a filter finds by itself. The rest depends on the motion; an estimator that knows
-it has a quarter less error, and a consistent covariance.
+MuJoCo's tyres are soft and creep a little, so the wheels do not turn by exactly the distance over the radius. A part of
+the difference, 0.05 % of the radius, is constant, and an estimator finds it by itself. The rest depends on the motion;
+an estimator that knows it has a quarter less error, and a consistent covariance.
 """
 
 # pyright: reportAttributeAccessIssue=false
