@@ -198,7 +198,7 @@ class UserFeedforward:
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets the robots with these indices."""
-        self.stage.call("restore", rows)
+        self.stage.call("restore", rows.copy())
 
     def adapted(self) -> Array:
         """Returns what each robot has learned, flat, `(B, n)`; n is 0 if it keeps nothing.

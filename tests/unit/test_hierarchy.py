@@ -16,7 +16,7 @@ from mrctl.kernel import over_rows
 from mrctl.loop.courses import GOAL
 from mrctl.loop.hierarchy import HAND_OVER_SHARE, Hierarchy
 from mrctl.loop.user_hierarchy import UserHierarchy
-from mrctl.loop.user_stages import UserStage
+from mrctl.loop.user_stages import UserFeedforward, UserStage
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.sensing.prediction import SEEN
@@ -323,3 +323,25 @@ def test_other_settings(robot):
     assert hierarchy.weight_norm[0] == 0 < hierarchy.weight_norm[1]
     spread = np.abs(np.diff(log[:, :, 7], axis=0)).sum(axis=0)
     assert spread[1] < spread[0]  # the slower prefilter is the calmer one
+
+
+def test_a_stage_cannot_change_which_robots_are_reset(robot):
+    """A user's stage that writes into the indices of `restore` does not move what the hierarchy does with them next."""
+
+    class Counting:
+        def __init__(self, robot, size):
+            self.size = size
+
+        def output(self, command, derivative):
+            return np.zeros((self.size, 2))
+
+        def learn(self, feedback, frozen, twist, voltage):
+            pass
+
+        def restore(self, rows):
+            rows += 1
+
+    own = UserFeedforward(UserStage("feedforward", Counting, robot, 2), Prior([None] * 2, False), False, 0.01, 0.0)
+    rows = np.array([0])
+    own.restore(rows)
+    assert rows.tolist() == [0]
