@@ -120,9 +120,9 @@ def navigate(
         progress: Whether to show a progress bar.
 
     Raises:
-        InputError: The task is none, there is no such feedforward, the margin or the speed is out of range, start or
-            goal is within the margin of an obstacle or off the map, the robot is at its goal, there is no way, or the
-            robot cannot drive the plan or would touch an obstacle on it.
+        InputError: The task is none, there is no such feedforward or avoider, the margin or the speed is out of range,
+            start or goal is within the margin of an obstacle or off the map, the robot is at its goal, there is no way,
+            or the robot cannot drive the plan or would touch an obstacle on it.
     """
     if not isinstance(task, Task):
         raise InputError(f"task: must be a world with start and goal, such as `task_of` makes, not {task!r:.60}")
@@ -198,6 +198,7 @@ def jerk_of(places: Array, period: float) -> float:
         period: Control period in s.
     """
     n = max(1, round(JERK_STEP / period))
-    p, q, r, s = (places[k * n : len(places) - (3 - k) * n] for k in range(4))
+    count = max(0, len(places) - 3 * n)
+    p, q, r, s = (places[k * n : k * n + count] for k in range(4))
     jerks = (s - 3 * r + 3 * q - p) / (n * period) ** 3
     return float(np.sqrt(np.mean(np.sum(jerks**2, axis=1)))) if len(jerks) else np.nan
