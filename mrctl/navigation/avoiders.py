@@ -13,7 +13,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.hybrid_astar import NoWay
 from mrctl.navigation.mppi import LAG, Mppi
 from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.planning import REACTIVE, REPLAN_MARGIN, Avoid, Query, planned
+from mrctl.navigation.planning import REACTIVE, REPLAN_MARGIN, Avoid, Query, check_avoid, planned
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.navigation.window import Window
@@ -32,7 +32,11 @@ def avoiding(avoid: Avoid, *, lag: float = LAG) -> Callable[[Robot, int], Any] |
     Args:
         avoid: What keeps the robots from obstacles.
         lag: Time constant of the roll-outs of `mppi` in s; see `Mppi`.
+
+    Raises:
+        InputError: There is no such name.
     """
+    check_avoid(avoid)
     if avoid == "none":
         return None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -39,6 +39,16 @@ REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multip
 Avoid = Literal["none", "barrier", "window", "mppi"]
 REACTIVE = "window", "mppi"
 """Motion stages that go along a plan at their own pace; their plans never reverse."""
+
+
+def check_avoid(avoid: str) -> None:
+    """Refuses what is none of the names in `Avoid`.
+
+    Raises:
+        InputError: It is none; the message lists them.
+    """
+    if avoid not in get_args(Avoid):
+        raise InputError(f"avoid: {avoid!r} is none of {', '.join(get_args(Avoid))}")
 
 
 class Query(NamedTuple):
@@ -93,8 +103,9 @@ def prepared(
         twist: V in m/s and θ̇ in rad/s with which the robot drives at its start.
 
     Raises:
-        InputError: As `planned`; or forward there is no way, and `avoid` never plans in reverse.
+        InputError: As `planned`; or there is no such `avoid`, or it never plans in reverse and forward there is no way.
     """
+    check_avoid(avoid)
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
     query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
     try:

@@ -224,11 +224,15 @@ def test_bad_input_is_one_line(
 
 
 def test_bad_arguments() -> None:
-    """What is no task, and a feedforward that there is not, is refused by name."""
+    """What is no task, and a feedforward or an avoider that there is not, is refused by name."""
     task = task_of("doorway:3", Scenario())
     for given, compare, message in (("doorway:3", (), "^task: must be"), (task, "model", "^compare: 'm'")):
         with pytest.raises(mrctl.InputError, match=message):
             navigate(given, Scenario(), compare)
+    with pytest.raises(mrctl.InputError, match="^avoid: 'windw' is none of none, barrier, window, mppi"):
+        navigate(task, Scenario(), avoid="windw")  # type: ignore[arg-type]
+    with pytest.raises(mrctl.InputError, match="^avoid: 'windw'"):  # which is the stage of a batch or a sweep
+        avoiding("windw")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
