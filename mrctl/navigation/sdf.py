@@ -85,6 +85,21 @@ def _after(base: Array, pose: Array) -> Array:
     return found
 
 
+def _numbers(shape: ElementTree.Element, field: str, count: int, name: str) -> list[float]:
+    """Returns the numbers in a field of a shape; `name` is that of the model.
+
+    Raises:
+        InputError: There is no such field, or it has not as many numbers.
+    """
+    try:
+        found = [float(number) for number in (shape.findtext(field) or "").split()]
+    except ValueError:
+        found = []
+    if len(found) != count:
+        raise InputError(f"{name}: {shape.tag} has no valid {field}")
+    return found
+
+
 def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]:
     """Returns the obstacle of a collision element at its pose `(6,)`, or nothing for ground and what hangs overhead.
 
@@ -97,14 +112,12 @@ def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]
         return []
     if shape.tag not in ("cylinder", "box", "sphere"):
         raise InputError(f"{name}: its shape is a {shape.tag}, not a cylinder, box or sphere")
-    field = {"cylinder": "radius", "box": "size", "sphere": "radius"}[shape.tag]
-    try:
-        size = [float(number) for number in (shape.findtext(field) or "").split()]
-        length = float(shape.findtext("length") or 2 * size[0])
-        size = np.array(size).reshape(3 if shape.tag == "box" else 1)
-    except (ValueError, IndexError):
-        raise InputError(f"{name}: {shape.tag} has no valid {field}") from None
-    half = size[2] / 2 if shape.tag == "box" else length / 2
+    size = _numbers(shape, "size", 3, name) if shape.tag == "box" else _numbers(shape, "radius", 1, name)
+    if shape.tag == "cylinder":
+        (height,) = _numbers(shape, "length", 1, name)
+    else:
+        height = size[2] if shape.tag == "box" else 2 * size[0]
+    half = height / 2
     if pose[2] + half <= GROUND_HEIGHT:
         return []
     if shape.tag != "sphere" and np.abs(pose[3:5]).max() > 1e-3:

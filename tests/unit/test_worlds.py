@@ -162,6 +162,8 @@ def test_sdf_lintel(tmp_path):
         ("0.5 0 0 0", "0.5", "is not six numbers"),
         ("<pose>0.5", '<pose relative_to="door">0.5', "c: pose: is relative to door"),
         ("<radius>0.075</radius>", "", "cylinder has no valid radius"),
+        ("<length>1</length>", "<length>1 m</length>", "cylinder has no valid length"),
+        ("<length>1</length>", "", "cylinder has no valid length"),
     ],
 )
 def test_no_sdf(tmp_path, before, after, message):
