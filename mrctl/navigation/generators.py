@@ -46,8 +46,13 @@ def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, c
         steps: Number of steps.
         cell: Side of a cell in m.
         cells: Number of cells along each side of the field.
+
+    Raises:
+        InputError: The share is out of range, or a size is not positive.
     """
     _positive(cell=cell, cells=cells)
+    if not 0 <= fill <= 1:
+        raise InputError(f"fill: must be between 0 and 1, not {fill:g}")
     filled = np.random.default_rng(seed).random((cells, cells)) < fill
     for _ in range(steps):
         neighbours = _neighbours(filled)
@@ -82,7 +87,7 @@ def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, 
         turn: Largest bend between two pieces in rad, below π/2.
 
     Raises:
-        InputError: A wall would fold over itself.
+        InputError: A wall would fold over itself, or a size is not positive.
     """
     _positive(width=width, pieces=pieces, length=length)
     if not 0 <= turn < np.pi / 2 or (width / 2 + WALL_THICKNESS) * np.tan(turn / 2) >= length / 2:
@@ -178,7 +183,7 @@ def doorway(width: float, seed: int = 0, room: float = 4.0) -> Task:
         room: Side of a room in m, from middle to middle of its walls.
 
     Raises:
-        InputError: The door is wider than half a room.
+        InputError: The door is wider than half a room, or a size is not positive.
     """
     _positive(width=width, room=room)
     if width > room / 2:
@@ -220,8 +225,8 @@ def warehouse(
     Args:
         aisle: Width of the aisles between the shelves in m; along the walls it ends in the middle of the wall.
         seed: Seed of the missing shelves, and of the aisles of start and goal.
-        rows: Number of rows of shelves, across y.
-        columns: Number of shelves in a row.
+        rows: Number of rows of shelves, one beside another along y.
+        columns: Number of shelves in a row, which goes along x.
         shelf: Length along x and width of a shelf in m.
     """
     _positive(aisle=aisle, rows=rows, columns=columns, length=shelf[0], width=shelf[1])

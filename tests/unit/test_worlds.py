@@ -229,9 +229,14 @@ def test_automaton():
 
 @pytest.mark.parametrize(
     "make",
-    [lambda: generators.corridor(-1.0), lambda: generators.corridor(8.0), lambda: generators.doorway(3.0)],
+    [
+        lambda: generators.corridor(-1.0),
+        lambda: generators.corridor(8.0),
+        lambda: generators.doorway(3.0),
+        lambda: generators.cellular(1, fill=20.0),
+    ],
 )
 def test_impossible_worlds(make):
-    """Widths that make no world are refused."""
-    with pytest.raises(InputError, match="width|turn"):
+    """Sizes and shares that make no world are refused."""
+    with pytest.raises(InputError, match="width|turn|fill"):
         make()
