@@ -137,7 +137,10 @@ def _without(known: Outlines, gone: NDArray[np.bool]) -> Outlines:
 
 
 def through(points: Array, scan: Scan) -> NDArray[np.bool]:
-    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `PLACE_RADIUS` there, `(k,)`."""
+    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `PLACE_RADIUS` there, `(k,)`.
+
+    A beam passes if what it meets is farther away than the point by more than `MAX_OFFSET`.
+    """
     found = np.empty(len(points), bool)
     beams = scan.ranges, scan.full_turn, float(scan.angles[0]), scan.step, scan.reach
     pass_through.compiled(np.ascontiguousarray(points), *beams, scan.place, found)

@@ -269,10 +269,10 @@ def farthest(
 def cost_to_go(where: Space, goal: Array) -> Array:
     """Returns the length of the shortest way from each cell to the goal's around the obstacles in m, `(rows, columns)`.
 
-    A cell is free where P keeps its distance from the nearest side of the footprint. The length solves the eikonal
-    equation |∇T| = 1 on the cells to first order (Sethian, "A fast marching level set method for monotonically
-    advancing fronts", PNAS 93(4), 1996): in the open it is at most 1.7 cells too long 200 cells away. It is infinite
-    where there is no way.
+    A cell is blocked where, with P anywhere in it, an obstacle is nearer to P than the nearest side of the footprint
+    and the margin together, so that no heading is free. The length solves the eikonal equation |∇T| = 1 on the cells to
+    first order (Sethian, "A fast marching level set method for monotonically advancing fronts", PNAS 93(4), 1996): in
+    the open it is at most 1.7 cells too long 200 cells away. It is infinite where there is no way.
     """
     sides = np.roll(where.footprint, -1, axis=0) - where.footprint
     across = where.footprint[:, 0] * sides[:, 1] - where.footprint[:, 1] * sides[:, 0]

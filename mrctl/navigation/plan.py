@@ -14,7 +14,7 @@ from mrctl.theory.obstacles import Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import Limits
 
-MIN_CHORD = 1e-3  # m, chord below which the heading of an end is not looked at
+MIN_CHORD = 1e-3  # m; the curvature at an end is computed as if its chord were at least that long
 NEARLY_STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
 
 

@@ -93,7 +93,7 @@ class Considered(NamedTuple):
 
 
 def _path(pose: Array, twists: Array, step: float) -> Array:
-    """Returns the places, `(k, n + 1, 2)`, of unicycles that obey twists `(k, n, 2)` at once, as roll-outs do."""
+    """Returns the places, `(k, n + 1, 2)`, of unicycles that obey twists, `(k, n, 2)`, at once: without the lag."""
     turned = step * np.cumsum(twists[..., 1], axis=-1)
     heading = pose[2] + turned - step * twists[..., 1] / 2  # half-way through each step
     moves = step * twists[..., :1] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)

@@ -225,7 +225,7 @@ def _outlines(places: Array) -> Outlines:
 
 
 def _apart(discs: Array) -> Array:
-    """Returns discs, `(k, 5)`, each at least half of `DISC_SPACING` from those of them that were seen earlier."""
+    """Returns discs, `(k, 5)`, without those within half of `DISC_SPACING` of one that is kept and was seen earlier."""
     kept = np.zeros(len(discs), bool)
     for k in np.argsort(discs[:, 4], kind="stable"):
         kept[k] = not kept.any() or np.hypot(*(discs[kept, :2] - discs[k, :2]).T).min() >= DISC_SPACING / 2

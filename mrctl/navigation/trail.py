@@ -19,7 +19,7 @@ from mrctl.theory.obstacles import Outlines
 # number of places that are remembered, and the least distance of two of them in m
 MAX_PLACES, PLACE_SPACING = 200, 0.02
 LOOKAHEAD = 0.2  # distance in m of the place behind the robot to which it steers
-CHECKED_BEHIND = 0.1  # distance in m behind the robot within which it looks for obstacles
+CHECKED_BEHIND = 0.1  # distance in m by which it looks ahead on its way back whether it would touch an obstacle
 
 
 class Trail:
