@@ -289,15 +289,15 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         metrics: Names in `METRICS`; each has a panel.
 
     Raises:
-        InputError: A metric is unknown, or none is given, or the result has no run.
+        InputError: A metric is unknown, or none is given, or the result has no run or no lap.
     """
     if not metrics:
         raise InputError("metrics: at least one is needed")
     names = [known(name) for name in metrics]
     check_kind(result)
     laps = as_runs(result if "lap" in result.dims else per_lap(result))
-    if not laps.sizes["run"]:
-        raise InputError("result: no runs")
+    if not (laps.sizes["run"] and laps.sizes["lap"]):
+        raise InputError("result: no laps" if laps.sizes["run"] else "result: no runs")
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     figure, axes = _figure(
@@ -416,9 +416,14 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         result: What `simulate` returns, or one run of it.
         span: Length of the sliding window in s.
         motion: As for `mrctl.results.excitation.excitation`.
-        run: Index of the run whose features are drawn, one line each.
+        run: Index of the run whose features are drawn, one line each; from −1 backwards it counts from the last run.
+
+    Raises:
+        InputError: There is no such run; else as `mrctl.results.excitation.excitation`, where `span` is its `window`.
     """
     found, runs = exciting.excitation(result, span, motion), as_runs(result)
+    if not -runs.sizes["run"] <= run < runs.sizes["run"]:
+        raise InputError(f"run: {run} is not the index of one of {runs.sizes['run']} runs")
     kept = {name: ("run", runs[name].values) for name in ("feedforward", "failed") if name in runs.variables}
     found = found.assign_coords(kept)  # for the colours, and for the failures in the legend
     figure, axes = _figure(COLUMN_WIDTH, 1.2 * COLUMN_WIDTH, rows=2)

@@ -133,6 +133,9 @@ def test_plot(robot, tmp_path):
     first, second = figure.axes
     np.testing.assert_allclose(first.lines[1].get_ydata(), excitation(runs, 1.0)["least"].values[1])
     assert len(second.lines) == 8 and first.get_yscale() == second.get_yscale() == "log"
+    for run in (2, -3):
+        with pytest.raises(InputError, match=f"^run: {run} is not the index of one of 2 runs$"):
+            plots.excitation(runs, span=1.0, run=run)
     plots.save(figure, tmp_path, "excitation")
     assert (tmp_path / "excitation.png").stat().st_size > 5000
 

@@ -470,6 +470,7 @@ def test_leaves_settings_alone():
         (lambda r: plots.path(metrics.per_lap(r)), "result"),
         (lambda r: plots.learning_curve(r, ["speed"]), "metric"),
         (lambda r: plots.learning_curve(r, []), "metrics"),
+        (lambda r: plots.learning_curve(metrics.per_lap(r).isel(lap=slice(0))), "result"),
         (lambda r: plots.laps_by_case({"a": r}, "speed"), "metric"),
         (lambda r: plots.laps_by_case({}, "energy"), "cases"),
         (lambda r: plots.inverse_dynamics({}), "maps"),
