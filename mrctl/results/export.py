@@ -4,25 +4,7 @@ Tables hold every signal of `results.dataset.SIGNALS` and end where a run failed
 columns `run` and `label`, its number and its name, and in MCAP the name of each topic begins with `/runK`. A run that
 did not drive, such as an impossible one, is left out, and a warning names it.
 
-| topic            | message                                 | content                                              |
-| ---------------- | --------------------------------------- | ---------------------------------------------------- |
-| `odom`           | nav_msgs/Odometry                       | true posture and twist, with the lateral velocity    |
-| `reference`      | nav_msgs/Odometry                       | reference posture and twist                          |
-| `cmd_vel`        | geometry_msgs/TwistStamped              | commanded twist                                      |
-| `joint_states`   | sensor_msgs/JointState                  | true angles and rates of wheels and fork             |
-| `estimate`       | nav_msgs/Odometry                       | estimated posture and twist with their covariances   |
-| `fix`            | geometry_msgs/PoseWithCovarianceStamped | posture fixes                                        |
-| `imu`            | sensor_msgs/Imu                         | gyro and accelerometer                               |
-| `encoders`       | sensor_msgs/JointState                  | angles of the rear wheels by their encoders          |
-| `encoder_counts` | std_msgs/Int64MultiArray                | the same angles in counts; exact encoders have none  |
-
-Times are simulated and start at zero. A sample of a sensor is logged when it arrives, and its header has the time when
-it was taken. Covariances of sensors are those of their white noise; in those of the estimate and of a fix, which are
-planar, the entries of z, roll and pitch are 0. The gyro measures θ̇ alone and the accelerometer two axes: the variances
-of the other axes are `UNMEASURED`, and the z axis of the accelerometer reads gravity. Each `imu` message is a sample of
-the gyro with the last one of the accelerometer; the covariance of its orientation begins with −1, which says that there
-is none. In `joint_states`, wheel angles are integrated by the trapezoid rule, and the fork's rate is a central
-difference.
+README.md lists the topics of an MCAP log, and says what their times and covariances are.
 """
 
 from __future__ import annotations
