@@ -21,7 +21,7 @@ MIN_BOOTSTRAP = 10
 
 
 class Interval(NamedTuple):
-    """A mean or median with its confidence interval, over the `samples` that are finite."""
+    """A mean, median or other quantile with its confidence interval; `samples` is the number of finite ones."""
 
     value: float
     low: float

@@ -321,7 +321,7 @@ def _checksums(folder: Path) -> dict[str, str]:
     return found
 
 
-def _check_sums(folder: Path, saved: dict[str, str]) -> None:
+def _refuse_changed(folder: Path, saved: dict[str, str]) -> None:
     """Compares the metadata of a result with the checksums that were saved; other functions look for missing files.
 
     Raises:
@@ -466,7 +466,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
         if CHECKSUMS in result.attrs:
-            _check_sums(Path(path), dict(result.attrs.pop(CHECKSUMS)))
+            _refuse_changed(Path(path), dict(result.attrs.pop(CHECKSUMS)))
     if gone := set(result.attrs.get(VARIABLE_NAMES, ())) - set(result.variables):
         raise InputError(f"{Path(path) / min(gone)}: missing")
     for folder, array in arrays.items():
