@@ -45,7 +45,7 @@ class Chosen(NamedTuple):
     """What a value of an axis of controllers stands for."""
 
     title: str
-    """Name in the table of runs, without the folder of a file."""
+    """Name in the table of runs, without the file of a controller."""
     own: str | None
     """Controller of the user, as for `mrctl.loop.user_files`, or None."""
     fields: dict[str, str]
@@ -112,6 +112,8 @@ class Axis(Record):
             raise ValueError(f"{self.field}: only values and grids can be paired or zipped")
         if self.field == CONTROLLER_FIELD and not all(isinstance(value, str) for value in self.values or (None,)):
             raise ValueError('controller: needs values that are names, such as "fel" or "my_file.py:MyController"')
+        if self.field == SCENARIO_FIELD and not all(isinstance(value, dict) for value in self.values or (None,)):
+            raise ValueError("scenario: needs values that are tables of changes, such as { laps = 4 }")
         for low, high in filter(None, (self.uniform, self.loguniform)):
             if not low < high:
                 raise ValueError(f"{self.field}: {low:g} is not below {high:g}")

@@ -260,6 +260,8 @@ def grid(start, stop, count):
         ("controller: .* no feedforward that adds", [axis("controller", values=["model+motion=a.py:A"])], {}),
         ("controller: needs values that are names", [axis("controller", values=[1])], {}),
         ("controller: needs values that are names", [axis("controller", uniform=[0, 1])], {}),
+        ("scenario: needs values that are tables", [axis("scenario", values=["heavy"])], {}),
+        ("scenario: needs values that are tables", [axis("scenario", uniform=[0, 1])], {}),
         ("controller: two values have the name A", [axis("controller", values=["fel", "a.py:A", "b/a.py:A"])], {}),
         ("controller: leave it out beside an axis", [axis("controller", values=["fel"])], {"controller": "a.py:A"}),
         ("hindsight: leave it out beside an axis", [axis("controller", values=["fel"])], {"hindsight": True}),
