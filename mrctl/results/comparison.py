@@ -61,7 +61,7 @@ def bootstrap_interval(
     """Returns the mean of the finite samples with its confidence interval.
 
     It is the bias-corrected, accelerated bootstrap interval (Efron, 1987), or for the mean of fewer than ten samples
-    Student's, because the bootstrap would be too narrow. That of the median is between two order statistics, as by
+    Student's, because the bootstrap would be too narrow. That of the median is between two order statistics, as in
     `quantile_interval`, because the bootstrap would be too narrow for any number of samples.
 
     Args:
@@ -74,6 +74,9 @@ def bootstrap_interval(
     Returns:
         The interval; the ends of a mean are NaN where fewer than two samples are finite, because one run does not show
         the spread, and those of a median are infinite where there are too few: at 95 % with fewer than six.
+
+    Raises:
+        InputError: The level is not between 0 and 1, or there is no resample.
     """
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
@@ -90,10 +93,9 @@ def bootstrap_interval(
 def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
     """Returns the geometric mean of a / b over pairs (same seed, same perturbation), with its interval.
 
-    The interval is that of `bootstrap_interval` for the mean logarithm of the ratio.
-
-    Every pair has the same weight, however large its errors, and the ratio of b to a is the inverse of that of a to b.
-    A pair with an error of 0 has no such ratio and is left out.
+    The interval is that of `bootstrap_interval` for the mean logarithm of the ratio. Every pair has the same weight,
+    however large its errors, and the ratio of b to a is the inverse of that of a to b. A pair with an error of 0 has no
+    such ratio and is left out.
 
     Args:
         a: One number a run (n,); NaN or infinite where it failed.
@@ -103,7 +105,7 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
         seed: Seed of the resampling.
 
     Raises:
-        InputError: `a` and `b` differ in length.
+        InputError: `a` and `b` differ in length, or as `bootstrap_interval`.
     """
     first, second = _pairs(a, b)
     fine = np.isfinite(first), np.isfinite(second)
@@ -129,7 +131,7 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
         floor: Largest difference that counts as a tie, in the unit of the errors: what the integrator cannot resolve.
 
     Raises:
-        InputError: `a` and `b` differ in length.
+        InputError: `a` and `b` differ in length, or the level is not between 0 and 1.
     """
     _check_level(level)
     first, second = (np.where(np.isfinite(one), one, np.inf) for one in _pairs(a, b))
@@ -262,6 +264,8 @@ def _bootstrapped(samples: Array, level: float, n: int, seed: int) -> tuple[floa
     from scipy.stats import bootstrap  # the import takes 0.4 s
 
     _check_level(level)
+    if n < 1:
+        raise InputError(f"n: {n} is below 1")
     low = high = np.nan
     for method in ("BCa", "percentile"):
         with warnings.catch_warnings(), np.errstate(all="ignore"):

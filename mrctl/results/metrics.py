@@ -153,10 +153,12 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         each run; `failed` and `failure_time` as in the result. Coordinate `lap` counts from 1.
 
     Raises:
-        InputError: The result lacks a variable, or a lap is shorter than the control period.
+        InputError: The result lacks a variable or has no sample, or a lap is shorter than the control period.
     """
     require(result, ("time", *SAMPLED))
     runs = as_runs(result)
+    if not runs.sizes.get("time"):
+        raise InputError("result: no samples")
     size = runs.sizes["run"]
     period = control_period(runs)
     if (every := round(period / runs.attrs.get("control_period", period))) > 1:

@@ -303,6 +303,7 @@ def test_recovery_laps():
         (lambda r: metrics.per_lap(r.drop_vars("power")), "power"),
         (lambda r: metrics.per_lap(r.assign_coords(lap_time=("run", [1e-3]))), "lap_time"),
         (lambda r: metrics.per_lap(r.isel(time=[0]).assign_attrs({}).drop_attrs()), "control_period"),
+        (lambda r: metrics.per_lap(r.sel(time=slice(90, 91))), "result"),
         (lambda r: metrics.summary(r, lap=0), "lap"),
         (lambda r: metrics.summary(r, lap=9), "lap"),
         (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "speed"), "metric"),
