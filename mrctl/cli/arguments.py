@@ -34,7 +34,7 @@ POSE_FLAGS = "--goal", "--start", "--initial-pose"
 """Flags whose values may be written as x,y,θ."""
 
 LIST_FLAGS = "--controller", "--feedforward", "--compare", "--delay", "--tier"
-"""Flags whose values stand behind one of them; of two of them tyro would take the last."""
+"""Flags that take several values, and are given once; of a flag that is given twice tyro would take the last."""
 
 
 def expanded(arguments: list[str]) -> list[str]:

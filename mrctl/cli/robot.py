@@ -141,7 +141,7 @@ def tune(
         print(find(search, tier, out, json))
         return
     if tier != TIERS:
-        raise InputError("tier: is of --search; the design takes its delays from --delay")
+        raise InputError("tier: belongs to --search; the design takes its delays from --delay")
     if time_constant is not None and lag:
         raise InputError("lag: has no effect with --time-constant, as the IMC rule knows no lag")
     check_world(world, RobotFile.from_dict({"path": robot}, "robot"))

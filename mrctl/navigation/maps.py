@@ -37,9 +37,9 @@ class MapFile(Record):
     negate: bool = False
     """Whether white means occupied."""
     occupied_thresh: Share
-    """Probability, a dimensionless share of black, above which a pixel is occupied."""
+    """Probability above which a pixel is occupied; that of a pixel is its share of black, or of white with `negate`."""
     free_thresh: Share
-    """Probability, a dimensionless share of black, below which a pixel is free."""
+    """Probability below which a pixel is free."""
     mode: Literal["trinary", "scale"] = "trinary"
     """What is between the thresholds: unknown (`trinary`), or a probability (`scale`)."""
 

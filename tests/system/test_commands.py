@@ -315,7 +315,7 @@ def test_bad_scenario_is_one_line(
         (["navigate", "--suite", "--port", "9000"], "port: belongs to --view"),
         (["navigate", "--suite", "--initial_spread", "0", "0", "0"], "suite: has its own worlds"),
         (["check", "missing.xml"], "robot: no file missing.xml; there are car"),
-        (["tune", "--tier", "lab"], "tier: is of --search"),
+        (["tune", "--tier", "lab"], "tier: belongs to --search"),
         (["check", "submarine"], "robot: submarine is neither car"),
         (["run", "--fel.step", "7"], "fel.step"),
         (["run", "--fel.stride", "1"], "--fel.stride"),
