@@ -58,7 +58,7 @@ class Mppi(Reactive):
         self._noise = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2))
 
     def passes(self, row: int, period: float, scene: Scene) -> bool:
-        """Tells whether the chosen twists at least halve the distance of the robot from its target."""
+        """Tells whether the chosen twists, obeyed at once, at least halve the distance of the robot from its target."""
         considered = self.considered[row]
         assert considered is not None
         way, target = considered.paths(period)[1], scene.targets[-1, :2]

@@ -33,7 +33,8 @@ MIN_HEADWAY = 0.05, 0.5
 # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 STAY_TIME = 1.0
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
-BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
+BACK_PIECE = 0.4  # m, length of a piece of the way back, after which it looks for another plan
+BACK_SPEED = 0.4  # m/s, at most
 MAX_BACK_PIECES = 10  # largest number of pieces, as far as the `Trail` reaches
 BACK_CLEARANCE = 0.02  # m, clearance from what is not on the map while it goes back
 
@@ -156,7 +157,7 @@ class Agent:
         if not np.isfinite(pose).all():
             return False
         if self._pieces:
-            if self._gone(pose) < self._pieces * BACK[0] and self._back(pose, now):
+            if self._gone(pose) < self._pieces * BACK_PIECE and self._back(pose, now):
                 return True
             self.last = np.zeros(2)
         else:
@@ -217,7 +218,7 @@ class Agent:
     def _back(self, pose: Array, now: float) -> bool:
         """Lets `last` be the twist with which it goes back; returns whether it can."""
         outlines = self.planner.sight.outlines(now, BACK_CLEARANCE - PLACE_RADIUS)
-        twist = self._trail.back(pose, min(BACK[1], self.bounds.speed / 2), outlines)
+        twist = self._trail.back(pose, min(BACK_SPEED, self.bounds.speed / 2), outlines)
         if twist is not None:
             self.last = twist
         return twist is not None

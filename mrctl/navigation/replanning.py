@@ -174,16 +174,16 @@ class Planner:
         return None
 
 
-def _same(pose: Array, before: Outlines, now: Array, after: Outlines) -> bool:
-    """Tells whether pose and obstacles are the same within `UNCHANGED_WITHIN`, the radii of discs included."""
-    turn = np.angle(np.exp(1j * (now[2] - pose[2])))
+def _same(there: Array, before: Outlines, here: Array, now: Outlines) -> bool:
+    """Tells whether pose and obstacles are the earlier ones within `UNCHANGED_WITHIN`, the radii of discs included."""
+    turn = np.angle(np.exp(1j * (here[2] - there[2])))
     if (
-        np.hypot(*(now[:2] - pose[:2])) > UNCHANGED_WITHIN[0]
+        np.hypot(*(here[:2] - there[:2])) > UNCHANGED_WITHIN[0]
         or abs(turn) > UNCHANGED_WITHIN[1]
-        or not np.array_equal(before.edges, after.edges)
+        or not np.array_equal(before.edges, now.edges)
     ):
         return False
-    if not (len(before.discs) and len(after.discs)):
-        return len(before.discs) == len(after.discs)
-    away = np.linalg.norm(before.discs[:, None] - after.discs, axis=2)
+    if not (len(before.discs) and len(now.discs)):
+        return len(before.discs) == len(now.discs)
+    away = np.linalg.norm(before.discs[:, None] - now.discs, axis=2)
     return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= UNCHANGED_WITHIN[2])
