@@ -173,6 +173,11 @@ def one_line(box: str, command: str) -> str:
     parts = re.split(r"(?:^|\n)[-─]{8,}(?:\n|$)", "\n".join(lines).strip())
     parts = [" ".join(part.split()) for part in parts if part.strip()]
     text = re.sub(r"\[/?bold\]", "", parts[min(titled, len(parts) - 1)]) if parts else "bad arguments"
+    if text.startswith("Missing from "):  # what is missing is indented less than what it means
+        missing = re.findall(r"^[│| ] {5}(?! |mrctl )(.*?) *[│|]?$", box, re.MULTILINE)
+        return f"{', '.join(missing)}: missing; see mrctl {command} --help"
+    if match := re.match(r"Missing value for argument '-*([\w.-]+)'", text):
+        return f"{match[1]}: needs a value; see mrctl {command} --help"
     if match := re.match(r"Error parsing -*([\w.-]+): no type matching (.*?) could be instantiated", text):
         return f"{match[1]}: expected {re.sub('[{}]', '', match[2]).replace('|', ' or ')}"
     if match := re.match(r"Error parsing -*([\w.-]+): invalid literal for int\(\) with base 10: (.*)", text):
