@@ -491,12 +491,12 @@ class Simulation:
 
     def _end(self, tick: int) -> None:
         """Ends the runs that are at their goals, stuck or at their own end; the record of the tick is kept."""
-        for row, reason in self.goals.ended(tick, self.log.now).items():
-            if row in self._learned:
-                continue
-            if not reason and (coefficients := self.parameters()) is not None:
-                known, true = coefficients
-                self._final[row] = known[row], true[row]
+        ended = self.goals.ended(tick, self.log.now)
+        ended = {row: reason for row, reason in ended.items() if row not in self._learned}
+        if ended and not all(ended.values()) and (coefficients := self.parameters()) is not None:
+            known, true = coefficients
+            self._final |= {row: (known[row].copy(), true[row].copy()) for row in ended if not ended[row]}
+        for row, reason in ended.items():
             self.plant.fail(row, reason)
             self._keep_learned([row])
             if reason:

@@ -328,7 +328,7 @@ def test_other_settings(robot):
 def test_a_stage_cannot_change_which_robots_are_reset(robot):
     """A user's stage that writes into the indices of `restore` does not move what the hierarchy does with them next."""
 
-    class Counting:
+    class Writing:
         def __init__(self, robot, size):
             self.size = size
 
@@ -341,7 +341,7 @@ def test_a_stage_cannot_change_which_robots_are_reset(robot):
         def restore(self, rows):
             rows += 1
 
-    own = UserFeedforward(UserStage("feedforward", Counting, robot, 2), Prior([None] * 2, False), False, 0.01, 0.0)
+    own = UserFeedforward(UserStage("feedforward", Writing, robot, 2), Prior([None] * 2, False), False, 0.01, 0.0)
     rows = np.array([0])
     own.restore(rows)
     assert rows.tolist() == [0]
