@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mrctl import InputError, Scenario
 from mrctl.control.design import design, plants
 from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.l1 import L1, L1Adaptive
@@ -117,40 +116,3 @@ def test_steering(robot):
         stage.prior = prior
         stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
     assert found[0, 1] == pytest.approx(np.exp(-A * PERIOD) * (0.5 + 0.02 - 0.45), rel=1e-6)
-
-
-def test_frozen(robot):
-    """It goes on while nothing may be learned, hands nothing over, has no weights, and forgets on `restore`."""
-    stage, prior = L1Adaptive(Loop(robot, False, PERIOD), [L1()]), Prior([robot], False)
-    for _ in range(20):
-        stage.output(np.ones((1, 2)), np.ones((1, 2)))
-        stage.prior = prior
-        assert not stage.learn(np.ones((1, 2)), np.ones(1), np.ones((1, 2)), np.full((1, 2), 3.0)).any()
-    assert stage.output(np.ones((1, 2)), np.ones((1, 2))).any()
-    assert not stage.guarded and not stage.weight_norm.any()
-    stage.restore(np.array([0]))
-    assert not stage.output(np.ones((1, 2)), np.ones((1, 2))).any()
-
-
-def test_rows(robot):
-    """Robots do not mix: a row has the same bits alone and beside one that is lost."""
-    inputs = RNG.uniform(-1, 1, (30, 3, 3, 2))
-
-    def answer(rows, lost=()):
-        size = len(inputs[0, 0, rows])
-        stage, prior, log = L1Adaptive(Loop(robot, False, PERIOD, 2), [L1()] * size), Prior([robot] * size, False), []
-        for command, twist, voltage in inputs[:, :, rows].copy():
-            twist[list(lost)] = np.nan
-            log.append(stage.output(command, command).copy())
-            stage.prior = prior
-            stage.learn(command, np.zeros(size), twist, voltage)
-        return np.array(log)
-
-    together = answer(slice(None), lost=[1])
-    for i in (0, 2):
-        assert together[:, i].tobytes() == answer(slice(i, i + 1))[:, 0].tobytes()
-
-
-def test_needs_a_model():
-    with pytest.raises(InputError, match="prior: the learner l1 compares the robot with a model; set prior to model"):
-        Scenario.from_dict({"prior": "none", "learner": "l1"})

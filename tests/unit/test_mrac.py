@@ -364,24 +364,3 @@ def test_hand_over(robot):
         added = stage.learn(np.ones((1, 2)), np.zeros(1), twist, np.full((1, 2), 3.0)).copy()
         np.testing.assert_allclose(stage.output(twist, twist) - before, added, atol=1e-12)
     assert added.any()
-
-
-def test_rows(robot):
-    """Robots do not mix: a row has the same bits alone and beside one that is lost."""
-    inputs = RNG.uniform(-1, 1, (60, 3, 3, 2))
-
-    def answer(rows, lost=()):
-        size = len(inputs[0, 0, rows])
-        stage, log = ModelReferenceAdaptive(Loop(robot, False, PERIOD, 2), [Mrac()] * size), []
-        prior = Prior([robot] * size, False)
-        for command, twist, voltage in inputs[:, :, rows].copy():
-            twist[list(lost)] = np.nan
-            log.append(stage.output(command, command).copy())
-            stage.prior = prior
-            stage.learn(command, np.zeros(size), twist, voltage)
-        return np.array(log)
-
-    together = answer(slice(None), lost=[1])
-    for i in (0, 2):
-        assert together[:, i].tobytes() == answer(slice(i, i + 1))[:, 0].tobytes()
-        assert together[-1, i].any()

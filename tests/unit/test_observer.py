@@ -102,20 +102,3 @@ def test_steering(robot):
         stage.output(command, np.zeros((1, 2)))
         stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
     assert stage.rows["disturbance"][0, 1] == pytest.approx(0.5 + 0.02 - 0.45, rel=1e-6)
-
-
-def test_rows(robot):
-    """Robots do not mix: a row has the same bits alone and beside one that is lost."""
-    inputs = RNG.uniform(-1, 1, (30, 3, 3, 2))
-
-    def answer(rows, lost=()):
-        stage, log = observer(robot, len(inputs[0, 0, rows])), []
-        for command, twist, voltage in inputs[:, :, rows].copy():
-            twist[list(lost)] = np.nan
-            log.append(stage.output(command, command).copy())
-            stage.learn(command, np.zeros(len(twist)), twist, voltage)
-        return np.array(log)
-
-    together = answer(slice(None), lost=[1])
-    for i in (0, 2):
-        assert together[:, i].tobytes() == answer(slice(i, i + 1))[:, 0].tobytes()
