@@ -565,7 +565,7 @@ class Live(Page):
             self._counted = now, session.tick
         self._status.content = block("status", *self._status_lines())
         happened = sum(event.time <= self.time for scenario in session.saved() for event in scenario.events)
-        happened += session.retunes
+        happened += session.oscillations
         if happened != self._happened:  # such as those that the scenarios brought along
             self._happened = happened
             self._describe()
@@ -665,8 +665,8 @@ class Live(Page):
         lines = ["<b>Present gains of the velocity PID</b>"]
         for channel, gains, (k_p, k_i) in zip(("common", "second"), self.session.gains(), units, strict=True):
             lines.append(f"{channel}: K_p {gains.k_p:.3g} {k_p}, K_i {gains.k_i:.3g} {k_i}")
-        if self.session.retunes:
-            lines.append(f"slowed {self.session.retunes} times, as the PID oscillated")
+        if self.session.oscillations:
+            lines.append(f"oscillations of the PID that slowed the controllers: {self.session.oscillations}")
         self._gains.content = block("gains", *lines)
 
 

@@ -277,10 +277,11 @@ class Session:
         return pid.channels(self.robot, self.start[0].steering == "rigid", delay, self.period)
 
     @property
-    def retunes(self) -> int:
-        """Number of moves that have slowed the controllers of the first robot; see `mrctl.control.delay`."""
+    def oscillations(self) -> int:
+        """Number of oscillations that have slowed the controllers of the first robot; see `mrctl.control.delay`."""
         sim, k = self._place[0]
-        return int(sim.hierarchy.state["delay"]["moves"][k])
+        moves = int(sim.hierarchy.state["delay"]["moves"][k])
+        return moves // 2 if self._stages else moves  # beside an avoider two moves answer each
 
     def saved(self) -> list[Scenario]:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""

@@ -513,6 +513,17 @@ def test_inputs_with_an_avoider(server, avoid):
     assert shown() == every
 
 
+@pytest.mark.parametrize("avoid", ["none", "window"])
+def test_oscillations(avoid):
+    """Each oscillation counts once, also beside an avoider, where two moves answer it."""
+    task = Task(obstacles=Obstacles(shapes=(CROSSING,)), start=(0.0, 0.0, 0.0), goal=(2.5, 0.0, 0.0))
+    session = Session([prepared(task, PID, avoid=avoid)[1]], avoid)
+    ((_, sim),) = session.simulations
+    for count in (1, 2):
+        sim.hierarchy._move(0)
+        assert session.oscillations == count
+
+
 def test_search(server):
     """Its arcs hang together, come from the start, and are free; the page draws those of a goal that is set."""
     behind = Task(obstacles=Obstacles(shapes=(Box(x=1.5, length=0.2, width=1.0),)), start=(0, 0, 0), goal=(3, 0, 0))
