@@ -116,7 +116,10 @@ def test_replay_of_a_mission(server, tmp_path):
         replay.draw()
         replay.refresh()
         assert replay._status.content.count("has arrived") == there
-    assert re.search(r"total variation of the voltage, both wheels: [\d.]+ V<", replay._status.content)
+    assert re.search(
+        r"<b>PID alone, metrics of its way:</b>.*total variation of the voltage, both wheels: [\d.]+ V<",
+        replay._status.content,
+    )
     start, goal = replay._scene.navigation._ends
     assert start.visible and start.position[:2] == pytest.approx([0, 0], abs=1e-9)
     assert goal.position[:2] == pytest.approx([1.5, -0.6]) and 2 * np.arcsin(goal.wxyz[3]) == pytest.approx(-0.5)
