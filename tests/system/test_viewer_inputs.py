@@ -294,7 +294,7 @@ def test_events_of_the_scenario():
 
 def test_stories(live):
     """A button sets a scene with its events; what its sentence promises happens."""
-    error = {}
+    error, runs = {}, {}
     for name, story in STORIES.items():
         live._tell(name)
         assert (
@@ -302,7 +302,7 @@ def test_stories(live):
             and story.watch in live._story.content
             and live.playing
         )
-        result = simulate(story.scenarios)
+        result = runs[name] = simulate(story.scenarios)
         error[name] = 1e3 * per_lap(result).position_rmse.values  # mm, of the learner and of PID alone
         fails = result.failure.values.tolist()
         assert fails == ["", "lateral error over 1 m" if "load" in name else ""]
@@ -310,6 +310,16 @@ def test_stories(live):
     assert 20 < load[0, 2:].min() and load[0, 2:].max() < 30 and (np.diff(load[1, :4]) > 0).all()
     assert 4.5 < battery[1, -1] / battery[0, -1] < 5.5 and battery[0, 1:].max() < battery[0, 0]
     assert 4 < ice[0, 1] < ice[1, 1] < 7 and ice[0, -1] < ice[0, 0]
+    car, _, slides = runs.values()
+    off = np.hypot(slides.longitudinal_error, slides.lateral_error)
+    for start, left in ((12, False), (18, True), (24, False), (30, True)):
+        half = slice(start, start + 5.99)
+        largest = 1e3 * off.sel(time=half).max("time")  # mm
+        assert ((10 < largest) & (largest < 15) if left else largest < 3).all()
+        assert bool((slides.omega_ref.sel(time=half).mean() > 0) == left)
+    alone = car.isel(run=1)
+    assert 3 < abs(alone.longitudinal_error).max() < 4 and 36 < alone.failure_time < 37
+    assert abs(alone.lateral_error.sel(time=slice(None, 24))).max() < 0.2  # of the push; it fails beyond 1 m
     live._restart([Scenario()])
     assert live._story.content == ""
 
