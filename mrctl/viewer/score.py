@@ -34,29 +34,25 @@ NUMBER_STYLE = "font-weight:500;text-align:right;vertical-align:bottom"
 EXPONENT_BELOW = 1e-3  # below which a number is written with an exponent
 
 
-def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[str, Array]]:
-    """Returns the metrics `(B,)` of `results.metrics.METRICS` of each whole lap, by name, and `alone`, `(B, 8)`.
+def one_lap(log: Rows, period: float, robot: Robot) -> dict[str, Array]:
+    """Returns the metrics `(B,)` of `results.metrics.METRICS` of a lap, by name, and `alone`, `(B, 8)`.
 
     The last is the excitation of each feature alone, as of `results.excitation.alone`.
 
     Args:
-        log: Record of `TICK` of each sample from the start of a lap and of each robot, `(T, B)`.
-        ticks: Number of samples in a lap.
+        log: Record of `TICK` of each sample of the lap and of each robot, `(T, B)`.
         period: Time between samples in s.
         robot: The nominal robot.
     """
-    laps = []
-    for start in range(0, len(log) - ticks + 1, ticks):
-        data = {name: log[name][start : start + ticks].T for name in log.dtype.names or ()}
-        command = np.stack([data["v_command"], data["omega_command"]], axis=-1)
-        size, scale = len(command), feature_scale(robot)
-        motion = command, period, np.full(size, robot.half_track), np.tile(scale, (size, 1))
-        laps.append(lap_metrics(data, data, period) | {"excitation": excitation(*motion), "alone": alone(*motion)})
-    return laps
+    data = {name: log[name].T for name in log.dtype.names or ()}
+    command = np.stack([data["v_command"], data["omega_command"]], axis=-1)
+    size, scale = len(command), feature_scale(robot)
+    motion = command, period, np.full(size, robot.half_track), np.tile(scale, (size, 1))
+    return lap_metrics(data, data, period) | {"excitation": excitation(*motion), "alone": alone(*motion)}
 
 
 def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> tuple[list[dict[str, Array]], bool]:
-    """Returns what `whole_laps` does of a way to a goal, as one lap, and whether it is final.
+    """Returns what `one_lap` does of a way to a goal, in a list, and whether it is final.
 
     There is none of a way that has hardly begun. It is final when each robot has arrived, or has failed.
 
@@ -73,7 +69,7 @@ def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> tuple[li
     found = []
     for row, at in enumerate(there.T):
         samples = max(2, int(at.argmax()) + 1) if at.any() else len(log)
-        found += whole_laps(log[:samples, row : row + 1], samples, period, robot)
+        found.append(one_lap(log[:samples, row : row + 1], period, robot))
     final = bool(np.all(there.any(axis=0) | np.isnan(log["x"][-1])))
     return [{name: np.concatenate([of[name] for of in found]) for name in found[0]}], final
 
@@ -82,7 +78,7 @@ class Metrics:
     """Metrics of what robots have driven on their present reference: of each whole lap, or of the way to its end.
 
     Attributes:
-        laps: As from `whole_laps`, or, of a way, at most one, from `on_the_way`.
+        laps: Of each lap what `one_lap` returns, or, of a way, at most one, from `on_the_way`.
         way: Whether they are of a way.
     """
 
@@ -123,12 +119,11 @@ class Metrics:
                 self._until = until
             self.laps = self._all
         else:
-            ticks = round(followed(scenarios[0], now).period / self._period)
-            done, known = (until - begin) // ticks, len(self._all)
-            if done > known:
-                self._all += whole_laps(
-                    log(begin + known * ticks, begin + done * ticks), ticks, self._period, self._robot
-                )
+            lap = followed(scenarios[0], now).period / self._period  # samples, as of `results.metrics.laps_of`
+            done = int((until - begin + 0.5) / lap + 1e-6)
+            for k in range(len(self._all), done):
+                start, end = (begin + round(number * lap) for number in (k, k + 1))
+                self._all.append(one_lap(log(start, min(end, until)), self._period, self._robot))
             self.laps = self._all[:done]
         self.way = way
 

@@ -11,9 +11,10 @@ from mrctl.control.features import FEATURE_NAMES
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.results.excitation import alone, parameter_error
+from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.looks import Look
-from mrctl.viewer.score import lessons, whole_laps
+from mrctl.viewer.score import Metrics, lessons, one_lap
 from mrctl.viewer.session import Session, changed, pushed
 
 BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
@@ -172,7 +173,7 @@ def test_what_is_learned():
     error, expected = session.parameter_error(), parameter_error(single).values[0]
     assert error is not None and np.array_equal(error[0], expected) and np.isnan(error[1]).all()
     assert abs(expected).max() > 0.1 and Session(scenarios[1:]).parameter_error() is None
-    laps = whole_laps(session.log(), session.tick, session.period, session.robot)
+    laps = [one_lap(session.log(), session.period, session.robot)]
     robots = [Look("A & B", (1, 2, 3)), Look("fel", (4, 5, 6))]
     excited, common, difference = pd.read_html(
         io.StringIO(lessons(robots, laps, False, error, "now")), header=0, index_col=0
@@ -185,6 +186,18 @@ def test_what_is_learned():
     for table, k in ((common, 0), (difference, 1)):
         assert table["A & B"].astype(float).values == pytest.approx(expected[:, k], rel=0.06)
         assert (table["fel"] == "–").all()
+
+
+def test_laps_of_a_score():
+    """They are those of a result, also where a lap is no whole number of control periods."""
+    scenario = Scenario(learner="none", laps=4, reference=Circle(period=3.0066, radius=0.4))
+    result = simulate(scenario)
+    session = Session([scenario])
+    drive(session, result.sizes["time"])
+    metrics = Metrics(session.robot, session.period)
+    metrics.update(session.saved(), session.log, session.tick)
+    found = [lap["position_rmse"][0] for lap in metrics.laps]
+    assert np.array_equal(found, per_lap(result)["position_rmse"].values[0])
 
 
 def test_arrow_of_overlapping_pushes():
