@@ -312,15 +312,15 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         scale, text = _shown(name)
         ends: list[tuple[float, float, str, str]] = []
         for label, colour in _colours(laps).items():
-            rows = [row for row, other in enumerate(labels) if other == label]
-            values, failed = scale * laps[name].values[rows], laps["failed"].values[rows].astype(bool)
+            own = [row for row, other in enumerate(labels) if other == label]
+            values, failed = scale * laps[name].values[own], laps["failed"].values[own].astype(bool)
             kept, whole = _finished(values, failed)
             mean = kept[:, whole].mean(axis=0)
-            if len(rows) > 1:
+            if len(own) > 1:
                 one.plot(number, values.T, color=colour, lw=0.5, alpha=0.4)
             one.plot(number[whole], mean, "o-", ms=2.5, lw=1.2, color=colour)
             at = (number[whole][-1], mean[-1]) if whole.any() else (number[0], np.nan)
-            ends.append((float(at[0]), float(at[1]), _counted(label, int(failed.sum()), len(rows)), colour))
+            ends.append((float(at[0]), float(at[1]), _counted(label, int(failed.sum()), len(own)), colour))
         one.set_title(text)
         one.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
         _scale(one, laps[name].values)
@@ -357,10 +357,10 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     for one, (title, laps) in zip(axes, cases.items(), strict=False):
         number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
         for label in dict.fromkeys(labels):
-            rows = [row for row, other in enumerate(labels) if other == label]
-            failed = laps["failed"].values[rows].astype(bool)
+            own = [row for row, other in enumerate(labels) if other == label]
+            failed = laps["failed"].values[own].astype(bool)
             lost.setdefault(label, []).extend(failed.tolist())
-            values, whole = _finished(scale * laps[metric].values[rows], failed)
+            values, whole = _finished(scale * laps[metric].values[own], failed)
             line = _line([*lost].index(label))
             if whole.any():
                 low, mean, high = (f(values[:, whole], axis=0) for f in (np.min, np.mean, np.max))

@@ -247,6 +247,18 @@ class Library:
         if run not in self.table.index:
             raise InputError(f"run: {self._path} has no run {run}")
 
+    def first_shown(self, run: int | None) -> list[int]:
+        """Returns the runs that are shown first: the one that is asked for, or all of a few, or else the first.
+
+        Raises:
+            InputError: There is no such run.
+        """
+        if run is not None:
+            self.check(run)
+            return [run]
+        every = [int(k) for k in self.table.index]
+        return every if len(every) <= MAX_SHOWN else every[:1]
+
     def recording(self, run: int) -> Recording:
         """Returns a run: one of a result is read, one of a sweep is simulated once more, with the same bits.
 

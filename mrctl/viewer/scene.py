@@ -135,7 +135,7 @@ class Scene:
                 self._floors.append(
                     self._scene.add_grid(
                         name, FLOOR_WIDTH, FLOOR_WIDTH, cell_size=0.5, section_size=1, plane_opacity=1.0,
-                        shadow_opacity=0.0,                         wxyz=turn, position=data.geom_xpos[geom],
+                        shadow_opacity=0.0, wxyz=turn, position=data.geom_xpos[geom],
                     )
                 )  # fmt: skip
             else:

@@ -31,7 +31,7 @@ from mrctl.theory.obstacles import Surroundings
 from mrctl.viewer.cameras import MIN_VIEW, OVERVIEW, fitted, to_see
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
-from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path, references_of
+from mrctl.viewer.recording import Library, Recording, joint_log, looks_of, path, references_of
 from mrctl.viewer.sensors import magnification
 
 Picture = NDArray[np.uint8]
@@ -68,8 +68,8 @@ def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
     if not os.access(out.parent, os.W_OK):  # before all pictures are drawn
         raise InputError(f"out: {out.parent} is no folder in which a file can be written")
     library = Library(folder, code)
-    shown = [int(k) for k in library.table.index] if run is None else [run]
-    recordings = [library.recording(k) for k in (shown if len(shown) <= MAX_SHOWN else shown[:1])]
+    shown = library.first_shown(run)
+    recordings = [library.recording(k) for k in shown]
     period = 1 / RATES[out.suffix]
     times = np.arange(0, max(period, *(r.duration for r in recordings)), period)  # one picture of a single sample
     pictures = _pictures(recordings, looks_of(recordings, shown), times, *SIZES[out.suffix])
@@ -110,10 +110,8 @@ def _pictures(
     """
     model = mjcf.clone(recordings[0].model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = (
-        SHADOW_PIXELS,
-        0,
-    )  # without a GPU these take most of the time
+    # Without a GPU shadows and samples take most of the time.
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = SHADOW_PIXELS, 0
     try:
         renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # each backend has errors of its own

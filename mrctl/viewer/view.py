@@ -83,23 +83,19 @@ def replay(folder: Path, run: int | None, export: Path | None, host: str, port: 
     """
     from mrctl.viewer.export import export as write
     from mrctl.viewer.export import refuse_existing
-    from mrctl.viewer.recording import MAX_SHOWN, Library, looks_of
+    from mrctl.viewer.recording import Library, looks_of
     from mrctl.viewer.replay import ReplayPage
 
     if export is not None:
         refuse_existing(export)
-    library = Library(folder / "result.zarr" if (folder / "result.zarr").is_dir() else folder, code)
-    table = library.table
-    if run is not None:
-        library.check(run)
-    shown = [int(table.index[0]) if run is None else run]
-    if run is None and len(table) <= MAX_SHOWN:
-        shown = [int(k) for k in table.index]
+    library = Library(folder, code)
+    shown = library.first_shown(run)
     if export is None:
         return _serve(lambda server: ReplayPage(library, shown, server), host, port)
     recordings = [library.recording(k) for k in shown]
     write(recordings, looks_of(recordings, shown), export)
-    left_out = f" (run {shown[0]} of {len(table)}; --run takes another)" if len(shown) < len(table) else ""
+    count = len(library.table)
+    left_out = f" (run {shown[0]} of {count}; --run takes another)" if len(shown) < count else ""
     print(f"page: {export}{left_out}")
 
 
