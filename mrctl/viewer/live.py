@@ -638,7 +638,8 @@ class Live(Page):
         before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
         lines = []
         for event in scenario.schedule:
-            lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
+            coming = " (to come)" * (event.time > self.time)
+            lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}{coming}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         self._timeline.content = block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"]))
         driven = self.session.driven()

@@ -276,7 +276,7 @@ def test_dragging(live):
 
 
 def test_events_of_the_scenario():
-    """A payload that the scenario brings along is drawn when it drops, and not before."""
+    """A payload that the scenario brings along is drawn when it drops, and until then the page says that it comes."""
     server = Server(port=0)
     drop = Event(time=0.05, perturbation=Perturbation(payload=8.0))
     live = Live([Scenario(events=(drop,))], server)
@@ -284,11 +284,12 @@ def test_events_of_the_scenario():
     for _ in range(4):
         live.session.step()
     live.refresh()
-    assert not box.visible
+    assert not box.visible and "payload 0 → 8 (to come)" in live._timeline.content
     for _ in range(3):
         live.session.step()
     live.refresh()
     assert box.visible and box.dimensions == pytest.approx((0.2, 0.2, 0.2))
+    assert "payload 0 → 8" in live._timeline.content and "to come" not in live._timeline.content
     server.stop()
 
 
