@@ -197,8 +197,8 @@ class ReplayPage(Page):
         last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
         bounds = [ends(recording.scenario, recording.start + self.time) for recording in self.recordings]
         lines += arrivals(self._labels, last, bounds)
-        part = "last lap" if self.recordings[0].scenario.goal is None else "way"
-        lines.append(f"<b>{html.escape(self._labels[0])}, metrics of its {part}:</b>")
+        part = "the run's last lap" if self.recordings[0].scenario.goal is None else "its whole way"
+        lines.append(f"<b>{html.escape(self._labels[0])}, metrics of {part}:</b>")
         row = self.library.table.loc[self.runs[0]]
         known = [_stated(str(column), value) for column, value in row.items() if isinstance(value, int | float)]
         lines += [line for line in known if line]

@@ -117,7 +117,7 @@ def test_replay_of_a_mission(server, tmp_path):
         replay.refresh()
         assert replay._status.content.count("has arrived") == there
     assert re.search(
-        r"<b>PID alone, metrics of its way:</b>.*total variation of the voltage, both wheels: [\d.]+ V<",
+        r"<b>PID alone, metrics of its whole way:</b>.*total variation of the voltage, both wheels: [\d.]+ V<",
         replay._status.content,
     )
     start, goal = replay._scene.navigation._ends
