@@ -10,7 +10,6 @@ import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import forking
 import pytest
 import victim
 from test_sweeps import FILE, children, content, failures, poisoned, refused, until
@@ -29,7 +28,8 @@ DASK = {
 }
 LONG = FILE.replace("chunk = 5", "chunk = 2")  # 12 jobs
 
-WORKERS = "--nworkers", "2", "--nthreads", "1", "--preload-nanny", forking.__file__
+# Not imported: in a test process it would start the fork server that the pool of a sweep shares, without its imports.
+WORKERS = "--nworkers", "2", "--nthreads", "1", "--preload-nanny", str(Path(__file__).with_name("forking.py"))
 
 
 def dask(*arguments):
