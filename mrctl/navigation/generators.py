@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +49,11 @@ def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, c
         cells: Number of cells along each side of the field.
 
     Raises:
-        InputError: The share is out of range, or a size is not positive.
+        InputError: The share is out of range, a size is not positive, or the seed or a number is not whole.
     """
-    _positive(cell=cell, cells=cells)
+    _positive(cell=cell)
+    _whole(0, seed=seed, steps=steps)
+    _whole(1, cells=cells)
     if not 0 <= fill <= 1:
         raise InputError(f"fill: must be between 0 and 1, not {fill:g}")
     filled = np.random.default_rng(seed).random((cells, cells)) < fill
@@ -87,9 +90,11 @@ def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, 
         turn: Largest bend between two pieces in rad, below π/2.
 
     Raises:
-        InputError: A wall would fold over itself, or a size is not positive.
+        InputError: A wall would fold over itself, a size is not positive, or the seed or the number is not whole.
     """
-    _positive(width=width, pieces=pieces, length=length)
+    _positive(width=width, length=length)
+    _whole(0, seed=seed)
+    _whole(1, pieces=pieces)
     if not 0 <= turn < np.pi / 2 or (width / 2 + WALL_THICKNESS) * np.tan(turn / 2) >= length / 2:
         raise InputError(f"turn: pieces of {length:g} m that are {width:g} m wide cannot bend by {turn:g} rad")
     headings, middle, mitre = bent_line(seed, pieces, length, turn)
@@ -163,8 +168,13 @@ def slalom(gap: float, seed: int = 0, gates: int = 5, spacing: float = 2.0, radi
         gates: Number of pairs.
         spacing: Distance of two pairs in m.
         radius: Radius of a cylinder in m.
+
+    Raises:
+        InputError: A size is not positive, or the seed or the number is not whole.
     """
-    _positive(gap=gap, gates=gates, spacing=spacing, radius=radius)
+    _positive(gap=gap, spacing=spacing, radius=radius)
+    _whole(0, seed=seed)
+    _whole(1, gates=gates)
     shifts = np.random.default_rng(seed).uniform(0.1, 0.3, gates) * spacing * (-1.0) ** np.arange(gates)
     discs = [
         Disc(x=spacing * (k + 1), y=shift + side * (gap / 2 + radius), radius=radius)
@@ -183,9 +193,10 @@ def doorway(width: float, seed: int = 0, room: float = 4.0) -> Task:
         room: Side of a room in m, from middle to middle of its walls.
 
     Raises:
-        InputError: The door is wider than half a room, or a size is not positive.
+        InputError: The door is wider than half a room, a size is not positive, or the seed is not whole.
     """
     _positive(width=width, room=room)
+    _whole(0, seed=seed)
     if width > room / 2:
         raise InputError(f"width: a door of {width:g} m is wider than half a room of {room:g} m")
     door, first, last = (float(y) for y in np.random.default_rng(seed).uniform(-room / 4, room / 4, 3))
@@ -206,8 +217,12 @@ def parking_bay(length: float, width: float, seed: int = 0, lane: float = 1.5) -
         width: Width of the bay, from the lane to the kerb, in m.
         seed: Seed of the start.
         lane: Width of the lane in m; beyond it is a wall.
+
+    Raises:
+        InputError: A size is not positive, or the seed is not whole.
     """
     _positive(length=length, width=width, lane=lane)
+    _whole(0, seed=seed)
     along, offset = np.random.default_rng(seed).uniform(-0.1, 0.1, 2) * (length, lane)
     cars = [Box(x=side * length, y=-width / 2, length=length, width=width) for side in (-1, 1)]
     ends = 2 * length
@@ -228,8 +243,13 @@ def warehouse(
         rows: Number of rows of shelves, one beside another along y.
         columns: Number of shelves in a row, which goes along x.
         shelf: Length along x and width of a shelf in m.
+
+    Raises:
+        InputError: A size is not positive, or the seed or a number is not whole.
     """
-    _positive(aisle=aisle, rows=rows, columns=columns, length=shelf[0], width=shelf[1])
+    _positive(aisle=aisle, length=shelf[0], width=shelf[1])
+    _whole(0, seed=seed)
+    _whole(1, rows=rows, columns=columns)
     random = np.random.default_rng(seed)
     dx, dy = shelf[0] + aisle, shelf[1] + aisle
     kept = random.random((rows, columns)) >= 0.1
@@ -265,3 +285,14 @@ def _positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise InputError(f"{name}: must be positive, not {value}")
+
+
+def _whole(least: int, **values: int) -> None:
+    """Refuses values that are no whole numbers, or smaller than the least.
+
+    Raises:
+        InputError: One is; the message names it.
+    """
+    for name, value in values.items():
+        if not (isinstance(value, Integral) and value >= least):
+            raise InputError(f"{name}: must be a whole number, at least {least}, not {value}")

@@ -240,3 +240,20 @@ def test_impossible_worlds(make):
     """Sizes and shares that make no world are refused."""
     with pytest.raises(InputError, match="width|turn|fill"):
         make()
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        *((make, "seed") for make in TASKS.values()),
+        (lambda _: generators.cellular(1, steps=-1), "steps"),
+        (lambda _: generators.cellular(1, cells=4.5), "cells"),
+        (lambda _: generators.corridor(1.0, pieces=2.5), "pieces"),
+        (lambda _: generators.slalom(0.8, gates=2.5), "gates"),
+        (lambda _: generators.warehouse(1.0, rows=2.5), "rows"),
+    ],
+)
+def test_numbers_that_are_not_whole(make, name):
+    """Seeds and numbers that are not whole, or too small, are refused by their names."""
+    with pytest.raises(InputError, match=f"^{name}: must be a whole number"):
+        make(-1)
