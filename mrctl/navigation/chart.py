@@ -19,11 +19,11 @@ from mrctl.theory.rays import Scan
 
 PLACE_RADIUS = 0.05  # m, of a disc around a place, through which beams pass or not
 # m, and share of the range: how far a point may lie beside the place to which it belongs; chosen
-MAX_OFFSET = (0.1, 0.02)
+MAX_OFFSET, MAX_OFFSET_SHARE = 0.1, 0.02
 MAX_FAR_OFFSET = 0.5  # m, at most
 MIN_POINTS = 2  # least number of points of a scan that show something
 # least and greatest number of places on a ring inside an obstacle, and m between; chosen
-RING_PLACES, RING_SPACING = (8, 32), 0.2
+MIN_RING_PLACES, MAX_RING_PLACES, RING_SPACING = 8, 32, 0.2
 RING_SIZES = 0.8, 0.4  # sizes of the two rings over that of the outline
 # scans that pass through a place, and share of the places, at which an obstacle is gone; chosen
 GONE_SCANS, GONE_SHARE = 5, 0.9
@@ -58,7 +58,7 @@ class Chart:
         if not len(points):  # nothing says that the lidar sees at all
             return False
         away = np.hypot(*(points - scan.place[:2]).T)
-        margin = np.minimum(MAX_OFFSET[0] + MAX_OFFSET[1] * away, MAX_FAR_OFFSET)
+        margin = largest_offset(away)
         for shape in np.flatnonzero(through(self._middles, scan)).tolist():
             places, depth = self._places[shape] = self._places.get(shape) or self._inside(shape)
             dense = scan.step * np.hypot(*(places - scan.place[:2]).T) < depth  # a beam would have met the obstacle
@@ -89,11 +89,11 @@ class Chart:
         if (ring := shape - len(discs)) >= 0:
             corners = edges[first[ring] : first[ring + 1], :2]
         else:
-            turn = np.linspace(0.0, 2 * np.pi, RING_PLACES[1], endpoint=False)
+            turn = np.linspace(0.0, 2 * np.pi, MAX_RING_PLACES, endpoint=False)
             corners = middle + discs[shape, 2] * np.column_stack([np.cos(turn), np.sin(turn)])
         around = np.vstack([corners, corners[:1]])
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(around, axis=0).T)))
-        count = int(np.clip(np.ceil(along[-1] / RING_SPACING), *RING_PLACES))
+        count = int(np.clip(np.ceil(along[-1] / RING_SPACING), MIN_RING_PLACES, MAX_RING_PLACES))
         outline = np.column_stack([np.interp(along[-1] / count * np.arange(count), along, side) for side in around.T])
         places = np.concatenate([[middle], *(middle + share * (outline - middle) for share in RING_SIZES)])
         return places, -float(self._distances(shape, middle[None])[0])
@@ -136,10 +136,15 @@ def _without(known: Outlines, gone: NDArray[np.bool]) -> Outlines:
     )
 
 
+def largest_offset(ranges: Array) -> Array:
+    """Returns how far points at these ranges may lie beside what they belong to; all in m and of the same shape."""
+    return np.minimum(MAX_OFFSET + MAX_OFFSET_SHARE * ranges, MAX_FAR_OFFSET)
+
+
 def through(points: Array, scan: Scan) -> NDArray[np.bool]:
     """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `PLACE_RADIUS` there, `(k,)`.
 
-    A beam passes if what it meets is farther away than the point by more than `MAX_OFFSET`.
+    A beam passes if what it meets is farther away than the point by more than `MAX_OFFSET` and `MAX_OFFSET_SHARE`.
     """
     found = np.empty(len(points), bool)
     beams = scan.ranges, scan.full_turn, float(scan.angles[0]), scan.step, scan.reach
@@ -147,7 +152,7 @@ def through(points: Array, scan: Scan) -> NDArray[np.bool]:
     return found
 
 
-def reached(points: Array, scan: Scan, margin: float) -> NDArray[np.bool]:
+def in_view(points: Array, scan: Scan, margin: float) -> NDArray[np.bool]:
     """Tells which points, `(k, 2)` in m, are in view and not beyond what their beam met by a margin in m, `(k,)`.
 
     The beam of a point is the one nearest in direction. A beam that met nothing reaches to the largest range.
@@ -182,7 +187,7 @@ def pass_through(
         away = np.hypot(dx, dy)
         half = np.arctan2(PLACE_RADIUS, away)
         beam = ((np.arctan2(dy, dx) - place[2] - first + step / 2) % (2 * np.pi)) / step
-        reach, wide = away + MAX_OFFSET[0] + MAX_OFFSET[1] * away, half / step
+        reach, wide = away + MAX_OFFSET + MAX_OFFSET_SHARE * away, half / step
         found[k] = reach <= most
         for i in range(int(np.floor(beam - wide)), int(np.floor(beam + wide)) + 1):
             around = i % turn

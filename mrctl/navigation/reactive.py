@@ -29,7 +29,7 @@ SAMPLES_PER_PERIOD = 5  # samples of the plan in a motion period
 MAX_PLAN_DISTANCE = 0.6  # m from its plan, beyond which a robot makes another one; chosen
 # m, and share of the way at full speed in the time HEADWAY_TIME: a robot makes headway if it covers the smaller one;
 # chosen
-MIN_HEADWAY = 0.05, 0.5
+MIN_HEADWAY, MIN_HEADWAY_SHARE = 0.05, 0.5
 # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 STAY_TIME = 1.0
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
@@ -187,7 +187,7 @@ class Agent:
         """
         if self._at_end(pose):
             self.planner.got_on, self.planner.blocked = now, np.inf
-        if self._gone(pose) > min(MIN_HEADWAY[0], MIN_HEADWAY[1] * HEADWAY_TIME * self.bounds.speed):
+        if self._gone(pose) > min(MIN_HEADWAY, MIN_HEADWAY_SHARE * HEADWAY_TIME * self.bounds.speed):
             self._anchor, self.planner.got_on, self._replanned = pose[:2].copy(), now, False
         blocked = self.planner.is_blocked(now) and not self.passes
         needs = blocked or self._away > MAX_PLAN_DISTANCE or self._waits(now)

@@ -9,6 +9,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.navigation.hybrid_astar import NoWay
 from mrctl.navigation.sight import Sight
+from mrctl.navigation.steer import CHECK_SPACING
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
@@ -17,11 +18,10 @@ from mrctl.theory.obstacles import Outlines, Pose
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 
-# m, rad and m, within which robot and obstacles are where they were when there was no way: more than the noise, and
-# more than half the distance of the discs that a scan shows. Chosen.
-UNCHANGED_WITHIN = 0.02, 0.05, 0.06
+# m and rad: a robot that has moved by no more than that is where it was when there was no way; more than the noise.
+# SAME_OBSTACLE is the distance in m for obstacles, more than half that of the discs that a scan shows. Chosen.
+SAME_PLACE, SAME_HEADING, SAME_OBSTACLE = 0.02, 0.05, 0.06
 FAILED_RETRY = 3.0  # s, after which a search that found no way is repeated in any case
-CHECK_SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
 BLOCKED_TIME = 0.3  # s for which a plan must be blocked by what stands: what moves seems to stand at first; chosen
 HEADWAY_TIME = 1.0  # s without headway, after which a robot makes another plan; chosen
 BLOCKED_RETRY = 1.0  # s, least time between two searches for a way around what blocks a plan; chosen
@@ -175,15 +175,15 @@ class Planner:
 
 
 def _same(there: Array, before: Outlines, here: Array, now: Outlines) -> bool:
-    """Tells whether pose and obstacles are the earlier ones within `UNCHANGED_WITHIN`, the radii of discs included."""
+    """Tells whether pose and obstacles are the earlier ones but for noise, the radii of discs included."""
     turn = np.angle(np.exp(1j * (here[2] - there[2])))
     if (
-        np.hypot(*(here[:2] - there[:2])) > UNCHANGED_WITHIN[0]
-        or abs(turn) > UNCHANGED_WITHIN[1]
+        np.hypot(*(here[:2] - there[:2])) > SAME_PLACE
+        or abs(turn) > SAME_HEADING
         or not np.array_equal(before.edges, now.edges)
     ):
         return False
     if not (len(before.discs) and len(now.discs)):
         return len(before.discs) == len(now.discs)
     away = np.linalg.norm(before.discs[:, None] - now.discs, axis=2)
-    return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= UNCHANGED_WITHIN[2])
+    return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= SAME_OBSTACLE)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
-from mrctl.navigation.chart import MAX_FAR_OFFSET, MAX_OFFSET, MIN_POINTS, PLACE_RADIUS, Chart, reached, through
+from mrctl.navigation.chart import MAX_FAR_OFFSET, MIN_POINTS, PLACE_RADIUS, Chart, in_view, largest_offset, through
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import Field, at, map_area, near_field
@@ -41,7 +41,7 @@ STANDING_SPEED = 0.1  # m/s, below which a cluster stands
 MEMORY = 1.0  # s, for which a cluster, and a disc that moves, is remembered
 # m: extra margin of a new plan around what is not on the map. Where the robot is nearer already, the margin is its
 # clearance less KEPT_CLEARANCE. Chosen.
-UNMAPPED_MARGIN, KEPT_CLEARANCE = 0.13, 0.03
+UNMAPPED_PLAN_MARGIN, KEPT_CLEARANCE = 0.13, 0.03
 NOTHING_SEEN = Surroundings(Obstacles()).at(0.0)
 
 
@@ -158,7 +158,7 @@ class Sight:
             pose: x and y in m and θ in rad, from which it plans, `(3,)`.
         """
         left = clearance(footprint, pose, self.standing) - KEPT_CLEARANCE
-        return self.outlines(time, min(UNMAPPED_MARGIN, max(0.0, left)))
+        return self.outlines(time, min(UNMAPPED_PLAN_MARGIN, max(0.0, left)))
 
     def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
         """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether the lidar sees its whole front.
@@ -171,7 +171,7 @@ class Sight:
         if self._field is not None:
             away = np.empty(len(points))
             from_map.compiled(self._field, points, away)
-            beside = away > np.minimum(MAX_OFFSET[0] + MAX_OFFSET[1] * ranges[met], MAX_FAR_OFFSET)
+            beside = away > largest_offset(ranges[met])
             met, points = met[beside], points[beside]
         if not len(met):
             return []
@@ -198,7 +198,7 @@ class Sight:
         gone = through(places, scan) | (moves & (scan.time - old[:, 4] > MEMORY))
         if len(new):
             near = np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * DISC_SPACING
-            gone |= near & (moves | reached(places, scan, 2 * DISC_SPACING))
+            gone |= near & (moves | in_view(places, scan, 2 * DISC_SPACING))
         return _apart(old[~gone])
 
 

@@ -22,7 +22,7 @@ LOOK_STEPS = 12  # steps, over which a constant twist is looked at; chosen, like
 NEARNESS_WEIGHT = 1.25
 # m, by which what the robot has found beside its map is enlarged: a roll-out neither knows the noise of the lidar, nor
 # how the robot departs from the twist, nor the side of an obstacle that no scan has shown yet. Chosen.
-UNMAPPED_MARGIN = 0.05
+UNMAPPED_TWIST_MARGIN = 0.05
 
 
 class Window(Reactive):
@@ -52,7 +52,7 @@ class Window(Reactive):
         roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, scene, np.inf, stops, braking)
         costs[braking >= TOUCH_COST] = np.inf
         if len(scene.movers):
-            off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, UNMAPPED_MARGIN]))
+            off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, UNMAPPED_TWIST_MARGIN]))
             # The twists of a roll-out do not depend on the scene: `stops` stays as it is.
             roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, off, np.inf, stops, wide)
             costs[wide >= TOUCH_COST] += TOUCH_COST
