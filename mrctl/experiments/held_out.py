@@ -142,9 +142,10 @@ def _log(out: Path, values: Mapping[str, Any]) -> None:
 
 def _said(out: Path, entry: str) -> bool:
     """Tells whether the last line of the log on a feedforward has its result, and not only that a drive was begun."""
-    log, of_entry = out / LOG_FILE, f'"entry": {json.dumps(entry)}'
-    own = [line for line in log.read_text().splitlines() if of_entry in line] if log.exists() else []
-    return bool(own) and '"says": ' in own[-1]
+    log = out / LOG_FILE
+    lines = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    own = [line for line in lines if line["entry"] == entry]
+    return bool(own) and "says" in own[-1]
 
 
 def _half(cell: Case) -> Case:

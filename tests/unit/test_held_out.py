@@ -3,6 +3,7 @@
 import hashlib
 import json
 from itertools import combinations, product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,14 @@ def test_can_be_driven(course: str) -> None:
     simulation = Simulation(plants)
     simulation.step()
     assert simulation.running
+
+
+def test_log_is_read_as_data(tmp_path: Path) -> None:
+    """Whether a result is logged depends on the last line on a feedforward, however that line is written."""
+    log = tmp_path / held_out.LOG_FILE
+    assert not held_out._said(tmp_path, "fel")
+    log.write_text('{"entry":"fel","says":"all"}\n{"entry": "rls"}\n')
+    assert held_out._said(tmp_path, "fel") and not held_out._said(tmp_path, "rls")
 
 
 def test_cells_above_a_rival_are_named() -> None:
