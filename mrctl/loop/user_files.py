@@ -248,6 +248,8 @@ def without_learned(name: str, scenario: Scenario) -> Scenario:
 def trial(name: str, scenario: Scenario) -> None:
     """Tries factories and stages on two robots for three ticks, before a long computation.
 
+    A robot that collides so early does so with every controller, and ends the trial.
+
     Raises:
         InputError: The name is refused, as by `load`; the scenario is refused; or the controller fails.
     """
@@ -258,6 +260,8 @@ def trial(name: str, scenario: Scenario) -> None:
     except StageError as error:
         raise InputError(f"controller: {error}") from None
     for _ in range(min(3, simulation.ticks)):
+        if not simulation.running:
+            break
         simulation.step()
-        for fault in filter(None, simulation.plant.failure):
+        for fault in (one for one in simulation.plant.failure if one not in ("", "collision")):
             raise InputError(f"controller: {fault.removesuffix(f', tick {simulation.tick - 1}')}")

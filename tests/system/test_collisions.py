@@ -6,6 +6,7 @@ import pytest
 import shapely
 
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario, load_robot, simulate
+from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.generators import warehouse
 from mrctl.navigation.tasks import obstacles_of
@@ -186,6 +187,23 @@ def test_start_in_an_obstacle():
     """A robot that would start in a collision is refused with one line."""
     with pytest.raises(InputError, match=r"initial_pose: the robot would stand in an obstacle at \("):
         simulate(Scenario(reference=Line(), laps=1, obstacles=wall(0.3)))
+
+
+OWN = """
+class Nothing:
+    def __init__(self, robot, size): pass
+    def output(self, command, derivative): return 0 * command
+    def learn(self, feedback, frozen, twist, voltage): pass
+"""
+
+
+def test_collision_in_a_trial(tmp_path):
+    """A controller that is tried is not blamed for what hits the robot meanwhile."""
+    (tmp_path / "own.py").write_text(OWN)
+    cart = Disc(x=-0.65, radius=0.2, course=Line(heading=np.pi, speed=2.0))  # from (0.65, 0) towards the robot
+    scenario = Scenario(reference=Line(), laps=1, obstacles=Obstacles(shapes=(cart,)))
+    assert simulate(scenario)["failure"].item() == "collision"
+    user_files.trial(f"{tmp_path / 'own.py'}:Nothing", scenario)
 
 
 def test_batch_equals_single():
