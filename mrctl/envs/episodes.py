@@ -30,6 +30,7 @@ OBSERVATIONS: dict[str, int] = {
 commanded steering angle (rad); voltages sent last (V)."""
 EPISODE_METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 """Metrics at the end of an episode, root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
+MAX_SEEDS = 2**32  # number of seeds that a scenario can have
 MAX_RESIDUAL = 0.25  # largest residual, as a share of the supply
 HALF_REWARD_DISTANCE = 0.05  # distance from the reference in m at which the reward is a half
 
@@ -216,7 +217,14 @@ class Episodes:
         self._action[row] = self._squares[row] = 0.0
 
     def begin_all(self, seeds: Sequence[int], perturbations: Sequence[object] | None = None) -> None:
-        """Begins another episode of every robot; see `begin` for the perturbations."""
+        """Begins another episode of every robot; see `begin` for the perturbations.
+
+        Raises:
+            InputError: No scenario can have a seed, there are not as many perturbations as robots, or as `begin`.
+        """
+        for seed in seeds:
+            if not 0 <= seed < MAX_SEEDS:
+                raise InputError(f"seed: {seed} is not between 0 and {MAX_SEEDS - 1}")
         perturbations = [None] * len(seeds) if perturbations is None else perturbations
         if len(perturbations) != len(seeds):
             raise InputError(f"perturbation: {len(perturbations)} of them for {len(seeds)} robots")

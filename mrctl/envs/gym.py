@@ -24,14 +24,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mrctl.envs.episodes import ACTION_KINDS, Action, Draw, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, MAX_SEEDS, Action, Draw, Episodes, read
 from mrctl.envs.navigation import Navigating, read_mission
 from mrctl.envs.pictures import Pictures
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
-MAX_SEEDS = 2**32  # number of seeds that a scenario can have
 RENDER_MODES = ["rgb_array"]
 
 
@@ -107,11 +106,11 @@ class TrackingEnv(gymnasium.Env):
             The observation, `(n,)`, and an empty dictionary.
 
         Raises:
-            InputError: An option is unknown or invalid.
+            InputError: An option is unknown or invalid, or no scenario can have the seed.
         """
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(MAX_SEEDS))
-        self.episodes.begin_all([drawn if seed is None else seed % MAX_SEEDS], [asked(options)])
+        self.episodes.begin_all([drawn if seed is None else seed], [asked(options)])
         return self.episodes.observe()[0][0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -227,7 +226,8 @@ class TrackingVectorEnv(VectorEnv):
             The observations, `(B, n)`, and an empty dictionary.
 
         Raises:
-            InputError: An option is unknown or invalid, or there are not as many seeds as robots.
+            InputError: An option is unknown or invalid, no scenario can have a seed, or there are not as many seeds as
+                robots.
         """
         if isinstance(seed, np.ndarray | np.integer):
             seed = seed.tolist()
@@ -244,7 +244,7 @@ class TrackingVectorEnv(VectorEnv):
         drawn = [self._draw(row) for row in range(self.num_envs)]
         perturbation = asked(options)
         several = perturbation if isinstance(perturbation, list | tuple) else [perturbation] * self.num_envs
-        self.episodes.begin_all([d if s is None else s % MAX_SEEDS for s, d in zip(seeds, drawn, strict=True)], several)
+        self.episodes.begin_all([d if s is None else s for s, d in zip(seeds, drawn, strict=True)], several)
         self._over[:] = False
         return self.episodes.observe()[0], {}
 

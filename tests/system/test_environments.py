@@ -527,6 +527,14 @@ def test_seeds_of_another_number():
         vector.reset(seed=[1, 2])
 
 
+def test_seeds_that_no_scenario_has():
+    """A seed beyond those of scenarios is refused, and not taken for a smaller one; so is that of a single row."""
+    with pytest.raises(InputError, match=r"^seed: 4294967296 is not between 0 and 4294967295$"):
+        TrackingEnv(SHORT).reset(seed=2**32)
+    with pytest.raises(InputError, match=r"^seed: 4294967296 is not"):
+        TrackingVectorEnv(2, SHORT).reset(seed=2**32 - 1)
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
 def test_no_copy(copied):
     """A copy would share the memory of the laws: it is refused, and the robot drives on with the same bits."""
