@@ -202,7 +202,9 @@ def test_collision_in_a_trial(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     cart = Disc(x=-0.65, radius=0.2, course=Line(heading=np.pi, speed=2.0))  # from (0.65, 0) towards the robot
     scenario = Scenario(reference=Line(), laps=1, obstacles=Obstacles(shapes=(cart,)))
-    assert simulate(scenario)["failure"].item() == "collision"
+    simulation = Simulation([scenario])
+    simulation.step()
+    assert simulation.plant.failure == ["collision"]
     user_files.trial(f"{tmp_path / 'own.py'}:Nothing", scenario)
 
 
