@@ -29,7 +29,7 @@ from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import RANDOM, REPLICATES, entries
 from mrctl.experiments.held_out import LOG_FILE
 from mrctl.experiments.suite_tables import COLUMNS, column_title, interval, titled
-from mrctl.experiments.tables import markdown, number, output_folder
+from mrctl.experiments.tables import markdown, number, output_folder, refuse_held
 from mrctl.record import InputError
 
 BEGINNING = """# Results
@@ -149,27 +149,23 @@ def drive(folder: Path) -> dict[str, tuple[Path, ...]]:
         The folders and files that they wrote, by input of `main`.
 
     Raises:
-        InputError: A command fails, or the folder cannot be made.
+        InputError: A command fails, the folder cannot be made, or a command would refuse what it holds, which is said
+            before any runs.
     """
     with output_folder(folder):
+        for command in SOURCES["tune"]:
+            if not _ended(folder, command):
+                refuse_held(folder / command.split()[-1], tuning.files())
         found = {name: tuple(_driven(folder, command) for command in own) for name, own in SOURCES.items()}
     return found
 
 
 def _driven(folder: Path, command: str) -> Path:
-    """Runs a command of `SOURCES`, unless this version has and it ended with status 0; returns where it wrote.
-
-    The log says how it ended: a command that drives several parts writes a table after the first, and one that set jobs
-    aside writes tables too.
-    """
+    """Runs a command of `SOURCES`, unless this version has and it ended with status 0; returns where it wrote."""
     words = command.split()
-    place, log = folder / words[-1], folder / ENDED_FILE
-    ended = json.dumps({"command": command, "mrctl": __version__})
-    with suppress(OSError, ValueError, LookupError):
-        table = json.loads((place if place.suffix else place / "table.json").read_text())
-        written = (table.get("versions") or table["machine"])["mrctl"]
-        if written == __version__ and ended in log.read_text().splitlines():
-            return place
+    place = folder / words[-1]
+    if _ended(folder, command):
+        return place
     print(f"mrctl {command}", flush=True)
     shown = subprocess.PIPE if ">" in words else None
     arguments = words[: words.index(">")] if shown else words
@@ -178,9 +174,28 @@ def _driven(folder: Path, command: str) -> Path:
         raise InputError(f"everything: mrctl {command} ended with status {done.returncode}")
     if shown:
         place.write_bytes(done.stdout)
-    with log.open("a") as file:
-        file.write(f"{ended}\n")
+    with (folder / ENDED_FILE).open("a") as file:
+        file.write(f"{_ending(command)}\n")
     return place
+
+
+def _ended(folder: Path, command: str) -> bool:
+    """Tells whether this version has run a command of `SOURCES` in a folder, and it ended with status 0.
+
+    Its table has to be there. The log says how it ended: a command that drives several parts writes a table after the
+    first, and one that set jobs aside writes tables too.
+    """
+    place = folder / command.split()[-1]
+    with suppress(OSError, ValueError, LookupError):
+        table = json.loads((place if place.suffix else place / "table.json").read_text())
+        written = (table.get("versions") or table["machine"])["mrctl"]
+        return written == __version__ and _ending(command) in (folder / ENDED_FILE).read_text().splitlines()
+    return False
+
+
+def _ending(command: str) -> str:
+    """Returns the line of the log on a command that this version has ended."""
+    return json.dumps({"command": command, "mrctl": __version__})
 
 
 def sections(page: str) -> dict[str, str]:

@@ -100,6 +100,16 @@ def centre_cell(samples: Array, digits: int, median: bool = False) -> str:
     return f"{value:.{digits}f}{interval}" if np.isfinite(value) else "–"
 
 
+def refuse_held(path: Path, files: Iterable[str]) -> None:
+    """Refuses a folder that holds one of the files that a command writes and does not overwrite.
+
+    Raises:
+        InputError: It does; the message names the first one.
+    """
+    if held := [name for name in files if (path / name).exists()]:
+        raise InputError(f"out: {path} holds {held[0]} already; nothing was overwritten")
+
+
 @contextlib.contextmanager
 def output_folder(path: Path | None, files: Iterable[str] = ()) -> Iterator[None]:
     """Makes the folder that a command writes to, before anything is computed for it.
@@ -116,8 +126,7 @@ def output_folder(path: Path | None, files: Iterable[str] = ()) -> Iterator[None
     if path is None:
         yield
         return
-    if held := [name for name in files if (path / name).exists()]:
-        raise InputError(f"out: {path} holds {held[0]} already; nothing was overwritten")
+    refuse_held(path, files)
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         try:

@@ -88,9 +88,14 @@ def tune(
     Raises:
         InputError: As `design`, or the folder cannot be written or holds such files already.
     """
-    with output_folder(out, ["table.json", *plots.files("sensitivity")]):
+    with output_folder(out, files()):
         table = design(world, Pid.from_dict({"time_constant": time_constant, "lag": lag}), delays, robot)
     return Report(json_text(table) if json else text(table), "", partial(_save, table, out))
+
+
+def files() -> list[str]:
+    """Returns the names of the files that `tune` writes and does not overwrite."""
+    return ["table.json", *plots.files("sensitivity")]
 
 
 def _save(table: dict[str, Any], out: Path | None) -> None:

@@ -232,6 +232,17 @@ def test_everything(
     assert ran[before:] == ["reproduce --out reproduction", "suite --held-out none --out held_out"]
 
 
+def test_refused_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """What `mrctl tune` would refuse after hours is refused at once."""
+    (tmp_path / "tune" / "imc").mkdir(parents=True)
+    (tmp_path / "tune" / "imc" / "table.json").write_text("{}")  # of another version, or of a command that was killed
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("a command runs"))
+    assert results_page.command(["--everything", str(tmp_path), "--out", str(tmp_path / "RESULTS.md")]) == 2
+    assert capsys.readouterr().err == f"out: {tmp_path}/tune/imc holds table.json already; nothing was overwritten\n"
+
+
 @pytest.mark.parametrize("source", [*results_page.SOURCES, "mppi", "limits"])
 def test_sources(source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Each input of the page has its commands, whose flags are flags of mrctl."""
