@@ -113,14 +113,21 @@ DRIVE_SIZES = {
 MOTORS = {
     "tiny": 'gear="20" motorconst="0.002 0.002" resistance="10" armature="1e-9" ctrlrange="-3 3"',
     "truck": 'gear="40" motorconst="0.5 0.5" resistance="0.05" armature="0.05" ctrlrange="-96 96"',
+    "direct": 'motorconst="1 1" resistance="0.5" armature="1e-3" ctrlrange="-24 24"',
 }
-SCALES = {"tiny": (0.2, 0.05, 2e-4), "truck": (10.0, 1500.0, 30.0)}  # size, mass in kg, frictionloss in N·m
+SCALES = {  # size, mass in kg, frictionloss in N·m
+    "tiny": (0.2, 0.05, 2e-4), "truck": (10.0, 1500.0, 30.0), "direct": (1.7, 15.0, 0.1),
+}  # fmt: skip
+MEASURED = (
+    "hold_on_slope", "top_speed", "stall", "coast_down", "centre_of_mass", "velocity_time_constant",
+    "rotation_time_constant",
+)  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["hold_on_slope", "top_speed", "stall", "coast_down", "centre_of_mass"])
+@pytest.mark.parametrize("name", MEASURED)
 @pytest.mark.parametrize("size", SCALES)
 def test_robots_of_any_size(tmp_path, size, name):
-    """A differential drive of 50 g on wheels of 1 cm, and one of 1.5 t on wheels of half a metre, obey equation (3)."""
+    """Drives of 50 g on wheels of 1 cm, of 1.5 t on wheels of half a metre, and without a gear obey equation (3)."""
     scale, mass, loss = SCALES[size]
     lengths = {key: scale * value for key, value in DRIVE_SIZES.items()}
     (tmp_path / "robot.xml").write_text(
@@ -144,9 +151,9 @@ def test_no_losses(name):
         assert check.unsuited(model) == "the robot has no Coulomb losses" and not check.unsuited(load())
 
 
-@pytest.mark.parametrize("name", ["stall", "energy"])
+@pytest.mark.parametrize("name", ["stall", "energy", "velocity_time_constant", "rotation_time_constant"])
 def test_inductance(tmp_path, name):
-    """The current of a winding follows within L/R, here 2 ms, which changes neither stall torque nor balance."""
+    """The current of a winding follows within L/R, here 2 ms, which changes neither stall torque, balance nor lag."""
     folder = shutil.copytree(models_folder(), tmp_path / "models")
     text = (folder / "car.xml").read_text()
     (folder / "car.xml").write_text(text.replace('resistance="2.32"', 'resistance="2.32" inductance="4.64e-3 0"'))
