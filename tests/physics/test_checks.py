@@ -120,7 +120,7 @@ SCALES = {  # size, mass in kg, frictionloss in N·m
 }  # fmt: skip
 MEASURED = (
     "hold_on_slope", "top_speed", "stall", "coast_down", "centre_of_mass", "velocity_time_constant",
-    "rotation_time_constant",
+    "rotation_time_constant", "energy",
 )  # fmt: skip
 
 
