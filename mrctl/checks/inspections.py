@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mrctl.checks.open_loop import Car, caster_gaps, is_steered, rolling_wheels
 from mrctl.kernel import Array
-from mrctl.physics.elements import MOTORS, REAR, fronts, part
+from mrctl.physics.elements import MOTORS, REAR, fronts, knuckles, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import RPM_PER_RAD_S, reaches_limits, sufficient_gears
@@ -510,6 +510,17 @@ def _servo(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     return _suspect("soft steering servo", odd, "raise kp", stiffen)
 
 
+def _spring(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    if not is_steered(model):
+        return None
+    stiffness = {joint: model.joint(joint).stiffness for joint in ("steering", *knuckles(model))}
+    odd = {
+        joint: f"joint {joint} has a stiffness of {float(k[0]):g} N·m/rad" for joint, k in stiffness.items() if k.any()
+    }
+    advice = "the spring turns the wheels back from the angle that is commanded, so remove it"
+    return _suspect("spring at the steering", odd, advice, lambda m, joint: [(m.joint(joint).stiffness, 0)])
+
+
 def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     limit = robot.steering_limit
     clause = f"the fork turns by {limit:.3g} rad at most, which is {np.degrees(limit):.3g}°"
@@ -528,6 +539,6 @@ INSPECTIONS = (
     _motors, _armature, _constant, _gear, _drag, _losses, _creep,
     _balance, _wheel_inertia, _gravity,
     _missing_contacts, _other_contacts, _condim, _grip, _short_contacts, _soft_contacts,
-    _fork, _servo, _degrees,
+    _fork, _servo, _spring, _degrees,
 )  # fmt: skip
 """All inspections, in the order in which their repairs are applied."""

@@ -80,9 +80,7 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
             rows = np.zeros(data.nefc)
             mujoco.mj_mulJacVec(model, data, rows, velocity)
             coulombs = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
-            slip = (
-                -(data.efc_force * rows)[data.efc_type != coulombs].sum() - data.qfrc_passive[forks] @ velocity[forks]
-            )
+            slip = -(data.efc_force * rows)[data.efc_type != coulombs].sum() - data.qfrc_damper[forks] @ velocity[forks]
             servo = data.qfrc_actuator[servos] @ velocity[servos]
             supplied += h * control[:2] @ current
             balance += h * (control[:2] @ current - robot.resistance * current @ current - slip + servo)

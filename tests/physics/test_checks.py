@@ -162,6 +162,14 @@ def test_inductance(tmp_path, name):
     check.run(model, read_robot(model))
 
 
+def test_energy_in_a_spring():
+    """A spring at a steered wheel holds energy, which is in the balance once."""
+    (check,) = (check for check in CHECKS if check.name == "energy")
+    model = load(robot=load_robot("racecar"))
+    model.joint("steering_front_left").stiffness[0] = 1.0
+    check.run(model, read_robot(model))
+
+
 @pytest.mark.parametrize("measured", [1.02, 0.98, math.nan, math.inf])
 def test_compare_refuses(measured):
     """A value that is out of tolerance or not finite fails the check."""

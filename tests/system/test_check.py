@@ -176,9 +176,11 @@ def test_nothing_odd():
 
 
 HUB = '<joint name="rear_left_wheel_joint"{}/>'
+KNUCKLE = '<default class="knuckle"><joint'
 ADOPTED = {
     "turtlebot": ('armature="7e-7"', "", "motors", "missing armature"),
     "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
+    "racecar spring": (KNUCKLE, KNUCKLE + ' stiffness="1"', "circle", "spring at the steering"),
     # Under another name the fork of the default robot is one that is steered by a servo, for which its own is too soft.
     "racecar motor": ('<dcmotor gear="10"', '<dcmotor damping="1e-5" gear="10"', "coast_down", "drag"),
     "car": ('<body name="fork"', '<body name="pivot"', "circle", "soft steering servo"),
