@@ -31,20 +31,19 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
         number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
         code: bool = True,
     ) -> None:
-        """Runs one scenario and prints its metrics lap by lap.
+        """Runs one scenario and prints its metrics lap by lap. The exit status is 1 if the run fails.
 
-        The exit status is 1 if the run fails.
+        mrctl run --learner rls --perturbation all --laps 2 reference:circle
 
         Args:
-            file: Run this scenario file, whose values flags override; or the folder --out of a run, which is then run
-                again and compared with what it holds, and the exit status is 1 if a bit differs; or with --run a
-                sweep's store.
+            file: A scenario file, whose values flags override; or the folder --out of a run, to repeat it and compare
+                every bit (status 1 if one differs); or with --run a sweep's store.
             scenario: The scenario.
-            out: Write the result, the figures and the learned weights to this folder.
+            out: Folder for the result, its figures and the learned weights.
             json: Print JSON instead of a table.
-            controller: Use stages of your own: my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
-            number: Drive the run of this number in a sweep's store again, and compare it with what is stored.
-            code: With --run: whether the Python files of the controller that the sweep names may be run.
+            controller: Stages of your own: my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
+            number: Repeat the run of this number in a sweep's store, and compare it.
+            code: With --run: whether a sweep's own Python files may be run.
         """
         if number is not None:
             return _repeat(file, number, arguments, out, json, code)
