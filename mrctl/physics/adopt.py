@@ -194,6 +194,7 @@ class _Adoption:
             and self._bottom(g) - floor < FLOOR_TOLERANCE * self.radius
         ]  # fmt: skip
         casters: list[Wheel] = []
+        names: list[str] = []
         for g in self._colliding(low) or low:
             body = self.model.body(self.model.geom_bodyid[g])
             centre = self.data.geom_xpos[g]
@@ -207,6 +208,7 @@ class _Adoption:
                     )
                 self._refuse_wheel_that_nothing_turns(caster)
                 casters.append(caster._replace(radius=radius))  # so that it touches the wheels' floor
+                names.append(part(self.model, g))
         if not casters:
             track = np.linalg.norm(self.rear[0].centre - self.rear[1].centre)
             unit = f"; their radius is {self.radius:.4g} m: is it in mm or cm?" if self.radius > track else ""
@@ -216,8 +218,7 @@ class _Adoption:
             )
         distances = [(caster.centre - self.origin) @ self.ahead for caster in casters]
         if len(casters) > 2 or min(distances) * max(distances) < 0:
-            names = _listed([caster.body for caster in casters])
-            raise InputError(f"caster: at most two, both ahead of the axle or both behind, not on {names}")
+            raise InputError(f"caster: at most two, both ahead of the axle or both behind, not {_listed(names)}")
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
 
     def _refuse_wheel_that_nothing_turns(self, caster: Wheel) -> None:
