@@ -282,6 +282,31 @@ def _gear(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     )
 
 
+def _grip_of_limits(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    """Compares the force that turning on the spot at both limits asks of a driven tyre with its grip."""
+    if is_steered(model):
+        return None  # the steered wheels turn it
+    arm, lever = robot.half_track, robot.mass * abs(robot.com_offset)
+    inertia = robot.yaw_inertia + robot.mass * robot.com_offset**2
+    along = inertia * robot.max_rotation_acceleration / arm + lever * robot.max_rotation**2
+    force = float(np.hypot(along, lever * robot.max_rotation_acceleration)) / 2
+    grip = robot.tyre_friction * robot.mass * robot.gravity * (1 - robot.front_load) / 2
+    if force <= grip:
+        return None
+    share = 0.5 * grip / force
+
+    def lower(m: mujoco.MjModel, limits: Part) -> list[Assignment]:
+        values = m.numeric(limits).data
+        return [(values[1:2], values[1] * share**0.5), (values[3:4], values[3] * share)]
+
+    clause = (
+        f"to turn at {robot.max_rotation:.3g} rad/s and {robot.max_rotation_acceleration:.3g} rad/s² each driven tyre "
+        f"needs {force:.3g} N along and across, and grips {grip:.3g} N"
+    )
+    advice = 'put more of the load on the driven wheels, or give lower <numeric name="limits">'
+    return _suspect("limits beyond the grip", {"limits": clause}, advice, lower)
+
+
 def _drag(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     joints = [j for j in ("chassis", *rolling_wheels(model)) if model.joint(j).damping.any()]
     motors = [motor for motor in MOTORS if model.actuator_damping[model.actuator(motor).id]]
@@ -536,7 +561,7 @@ def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 INSPECTIONS = (
     _edges, _centres, _axles, _places, _heights, _casters, _radii,
-    _motors, _armature, _constant, _gear, _drag, _losses, _creep,
+    _motors, _armature, _constant, _gear, _grip_of_limits, _drag, _losses, _creep,
     _balance, _wheel_inertia, _gravity,
     _missing_contacts, _other_contacts, _condim, _grip, _short_contacts, _soft_contacts,
     _fork, _servo, _spring, _degrees,

@@ -179,6 +179,7 @@ HUB = '<joint name="rear_left_wheel_joint"{}/>'
 KNUCKLE = '<default class="knuckle"><joint'
 ADOPTED = {
     "turtlebot": ('armature="7e-7"', "", "motors", "missing armature"),
+    "turtlebot ice": ('friction="0.8"', 'friction="0.04"', "turning_limits", "limits beyond the grip"),
     "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
     "racecar spring": (KNUCKLE, KNUCKLE + ' stiffness="1"', "circle", "spring at the steering"),
     # Under another name the fork of the default robot is one that is steered by a servo, for which its own is too soft.
