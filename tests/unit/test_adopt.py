@@ -435,7 +435,7 @@ ERRORS = {
     "no caster": (document(DIFF.replace(BALL.format(0.3), ""), MOTORS), {}, ("caster",)),
     "caster below": (document(DIFF.replace("-0.06", "-0.12"), MOTORS), {}, ("caster", "ball ends 60 mm below the fl")),
     "caster above": (document(DIFF.replace("-0.06", "-0.04"), MOTORS), {}, ("caster", "ball ends 20 mm above the fl")),
-    "casters around": (document(DIFF + BALL.format(-0.3).replace("ball", "o"), MOTORS), {}, ("caster", "not 'ball', 'o'")),
+    "casters around": (document(DIFF + BALL.format(-0.3).replace("ball", "o"), MOTORS), {}, ("caster", "'ball', 'o'")),
     "axles at an angle": (
         document(DIFF.replace('name="b" axis="0 1 0"', 'name="b" axis="1 1 0"'), MOTORS), {}, ("wheels", "axle")),
     "no servo": (document(TRICYCLE, MOTORS), {"steering": ("s1",)}, ("steering", "'s1'", "kp")),
