@@ -170,9 +170,9 @@ NUMBERS = """() => Object.values(window.__viserTestpoints.uplots).map(({chart}) 
     const width = Math.max(...axis._values.map((text) => pen.measureText(text).width)) / window.devicePixelRatio;
     return { numbers: axis._values, width: width + axis.ticks.size + axis.gap, room: axis._size };
 })"""
-CAMERA = """() => {
+CAMERA = """() => {  // nothing while a world is being built
     const m = window.__viserMutable;
-    return m.nodeRefFromName['/world'].worldToLocal(m.camera.position.clone()).toArray();
+    return m.nodeRefFromName['/world']?.worldToLocal(m.camera.position.clone()).toArray();
 }"""
 
 
