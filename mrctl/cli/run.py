@@ -33,7 +33,7 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
     ) -> None:
         """Runs one scenario and prints its metrics lap by lap. The exit status is 1 if the run fails.
 
-        mrctl run --learner rls --perturbation all --laps 2 reference:circle
+        For example: mrctl run --learner rls --perturbation all --laps 2 reference:circle
 
         Args:
             file: A scenario file, whose values flags override; or the folder --out of a run, to repeat it and compare
