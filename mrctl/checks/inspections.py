@@ -22,7 +22,7 @@ from mrctl.kernel import Array
 from mrctl.physics.elements import MOTORS, REAR, fronts, knuckles, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import RPM_PER_RAD_S, reaches_limits, sufficient_gears
+from mrctl.physics.units import RPM_PER_RAD_S, driven_grip, reaches_limits, sufficient_gears, turning_force
 from mrctl.theory.robot import GRAVITY, Robot
 
 Part = Any  # the name of an element of a model, or its index
@@ -286,11 +286,7 @@ def _grip_of_limits(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     """Compares the force that turning on the spot at both limits asks of a driven tyre with its grip."""
     if is_steered(model):
         return None  # the steered wheels turn it
-    arm, lever = robot.half_track, robot.mass * abs(robot.com_offset)
-    inertia = robot.yaw_inertia + robot.mass * robot.com_offset**2
-    along = inertia * robot.max_rotation_acceleration / arm + lever * robot.max_rotation**2
-    force = float(np.hypot(along, lever * robot.max_rotation_acceleration)) / 2
-    grip = robot.tyre_friction * robot.mass * robot.gravity * (1 - robot.front_load) / 2
+    force, grip = turning_force(robot), driven_grip(robot)
     if force <= grip:
         return None
     share = 0.5 * grip / force

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -118,16 +119,16 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     choices = suite.by_name((entry, *RIVALS) if known else RIVALS, () if known else (entry,))
     (name,) = (name for name in choices if name not in RIVALS)
     chosen = [one for cell in cells(count) for one in (cell, _half(cell))]
-    logged = {"entry": entry, "mrctl": versions()["mrctl"]}
+    this = {"entry": entry, "mrctl": versions()["mrctl"]}
     with output_folder(out):
         fresh = any(suite.left(out / "runs" / one) for one in choices)
         if fresh:
-            _log(out, logged | {"replicates": count, "settings": _settings(name) if known else None})
+            _log(out, this | {"replicates": count, "settings": _settings(name) if known else None})
         laps, aside = suite.run(chosen, choices, workers, out / "runs")
     rows = compare(name, suite.runs_of(chosen, laps))
     tables = summarised(name, rows, count)
     if fresh or not _said(out, entry):
-        _log(out, logged | {"says": tables[0].says})
+        _log(out, this | {"says": tables[0].says})
     (out / "table.md").write_text("\n".join(table.markdown for table in tables))
     source = {"versions": versions(), "machine": machine()}
     write_json(out / "table.json", source | {"mode": "held-out", "entry": entry, "cells": rows})
@@ -136,15 +137,26 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
 
 def _log(out: Path, values: Mapping[str, Any]) -> None:
     """Adds a line to the log, so that a drive that was begun is on record even without a result."""
-    with (out / LOG_FILE).open("a") as file:
-        file.write(json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values}) + "\n")
+    log = out / LOG_FILE
+    torn = log.exists() and not log.read_text().endswith("\n")
+    with log.open("a") as file:
+        line = json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values})
+        file.write("\n" * torn + line + "\n")
+
+
+def logged(log: str) -> list[dict[str, Any]]:
+    """Returns the lines of a log, without those that a killed process wrote in part."""
+    found = []
+    for line in log.splitlines():
+        with suppress(json.JSONDecodeError):
+            found.append(json.loads(line))
+    return found
 
 
 def _said(out: Path, entry: str) -> bool:
     """Tells whether the last line of the log on a feedforward has its result, and not only that a drive was begun."""
     log = out / LOG_FILE
-    lines = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
-    own = [line for line in lines if line["entry"] == entry]
+    own = [line for line in logged(log.read_text() if log.exists() else "") if line["entry"] == entry]
     return bool(own) and "says" in own[-1]
 
 

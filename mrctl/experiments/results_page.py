@@ -27,7 +27,7 @@ from mrctl.experiments import bench as benchmark
 from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import RANDOM, REPLICATES, entries
-from mrctl.experiments.held_out import LOG_FILE
+from mrctl.experiments.held_out import LOG_FILE, logged
 from mrctl.experiments.suite_tables import COLUMNS, column_title, interval, titled
 from mrctl.experiments.tables import markdown, number, output_folder, refuse_held
 from mrctl.record import InputError
@@ -250,8 +250,9 @@ def held_out_text(table: str, log: str) -> str:
         log: The content of `held_out.jsonl`.
     """
     tables = [text for title, text in sections(table).items() if title]
-    lines = [json.loads(line) for line in log.splitlines()]
-    driven = [f"- {one['time']}, {one['entry']}, mrctl {one['mrctl']}: {one.get('says') or 'begun'}" for one in lines]
+    driven = [
+        f"- {one['time']}, {one['entry']}, mrctl {one['mrctl']}: {one.get('says') or 'begun'}" for one in logged(log)
+    ]
     return "\n\n".join([*tables, "Drives through the cells that the folder of this one has logged:", "\n".join(driven)])
 
 

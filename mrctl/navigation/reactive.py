@@ -14,6 +14,7 @@ from mrctl.navigation.replanning import BLOCKED_RETRY, HEADWAY_TIME, SHORTER_SHA
 from mrctl.navigation.rollouts import NEAR_DISTANCE, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
+from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, near_field
@@ -74,7 +75,13 @@ class Agent:
         self._approached = False  # whether it has gone back from a goal at which it did not arrive
 
     def _sampled(self, plan: Waypoints) -> Array:
-        """Returns a plan as rows of `Scene.targets`, `SAMPLES_PER_PERIOD` in a motion period."""
+        """Returns a plan as rows of `Scene.targets`, `SAMPLES_PER_PERIOD` in a motion period.
+
+        Raises:
+            InputError: The plan reverses.
+        """
+        if plan.cusps:
+            raise InputError("reference: `window` and `mppi` follow plans that drive forward alone, without cusps")
         count = int(np.ceil(plan.period / self._period)) * SAMPLES_PER_PERIOD + 1
         poses = plan.sample(self._period / SAMPLES_PER_PERIOD * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])

@@ -75,7 +75,8 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     """Returns limits on V, θ̇, V̇ and θ̈, in SI units, for a robot whose file has none, from its motors and its grip.
 
     The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
-    a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across.
+    a sixth of the acceleration at stall, a half of the tyres' grip across, and a fifth of it along, which the driven
+    tyres alone have. Where nothing is steered, to turn on the spot takes at most half the grip of the driven tyres.
     """
     grip = robot.tyre_friction * robot.gravity
     speed = 0.64 * robot.velocity_gain * robot.supply
@@ -83,8 +84,26 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     if robot.steering_limit < ANY_ANGLE:
         rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
     stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
-    acceleration = min(stall / 6, 0.2 * grip)
-    return speed, rotation, acceleration, 2 * rotation * acceleration / speed
+    acceleration = min(stall / 6, 0.2 * grip * (1 - robot.front_load))
+    turning = 2 * rotation * acceleration / speed
+    if robot.steering_limit >= ANY_ANGLE:
+        limited = robot.model_copy(update={"max_rotation": rotation, "max_rotation_acceleration": turning})
+        share = min(0.5 * driven_grip(robot) / turning_force(limited), 1.0)
+        rotation, turning = rotation * share**0.5, turning * share
+    return speed, rotation, acceleration, turning
+
+
+def turning_force(robot: Robot) -> float:
+    """Returns the force in N, along and across, on each driven tyre that turns the robot on the spot at its limits."""
+    lever = robot.mass * abs(robot.com_offset)
+    inertia = robot.yaw_inertia + robot.mass * robot.com_offset**2
+    along = inertia * robot.max_rotation_acceleration / robot.half_track + lever * robot.max_rotation**2
+    return math.hypot(along, lever * robot.max_rotation_acceleration) / 2
+
+
+def driven_grip(robot: Robot) -> float:
+    """Returns the largest force in N that one driven tyre can carry at rest, μ M g (1 − front load)/2."""
+    return robot.tyre_friction * robot.mass * robot.gravity * (1 - robot.front_load) / 2
 
 
 def bounds(robot: Robot) -> list[Bound]:

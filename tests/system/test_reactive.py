@@ -5,7 +5,7 @@ import pytest
 from test_batch_equals_single import equal
 
 import mrctl
-from mrctl import Box, Disc, Obstacles, Scenario, simulate
+from mrctl import Box, Disc, Event, Obstacles, Scenario, simulate
 from mrctl.loop.simulation import arranged, uniform
 from mrctl.navigation import avoiders
 from mrctl.navigation.avoiders import avoiding
@@ -406,3 +406,19 @@ def test_speed_of_another_way(avoid: Avoid, first: float, second: float) -> None
     assert np.mean(speeds[40:50]) == pytest.approx(first, rel=0.1)
     assert np.mean(speeds[-20:]) == pytest.approx(second, rel=0.1)
     assert np.abs(np.diff(speeds)).max() <= robot.max_acceleration * period
+
+
+@pytest.mark.parametrize("avoid", AVOIDERS)
+def test_a_way_that_reverses(avoid: Avoid) -> None:
+    """The barrier follows a way with a cusp; `window` and `mppi`, whose roll-outs drive forward alone, refuse it."""
+    points = ((0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 0.02), (0.0, 0.08))
+    back = Waypoints(points=points, closed=False, timing="limits", cusps=(2,), speed=0.4)
+    task = Task(obstacles=Obstacles(shapes=(Disc(x=3.0, y=2.0, radius=0.2),)), start=(0.0,) * 3, goal=(2.0, 0.0, 0.0))
+    own = prepared(task, PLANNED.replace(steering="rigid"), avoid=avoid)[1]
+    result = simulate(own.with_event(Event(time=0.2, reference=back)), motion=avoiding(avoid))
+    failure = result.failure.item()
+    if avoid == "barrier":
+        assert not failure and result["v"].min() < -0.1
+    else:
+        assert "follow plans that drive forward alone, without cusps" in failure, failure
+        assert result["time"].max() > 0.1  # what was driven is kept

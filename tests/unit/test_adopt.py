@@ -372,6 +372,30 @@ def test_limits(file):
     assert found == pytest.approx((1.5, 3, 1.5, 6), rel=0.2)
 
 
+def test_limits_within_the_grip_of_the_driven_wheels(file):
+    """Derived limits ask no more of the driven tyres than their share of the loads that MuJoCo finds at rest."""
+    boxes = "<freejoint/>" + BOX.format(0.24).replace('mass="10"', 'mass="60"') + BALL.format(0.3)
+    text = document(boxes + wheel("a", "0 0.2 0") + wheel("b", "0 -0.2 0"), MOTORS).replace('gear="30"', 'gear="90"')
+    robot, model = read(file(text))
+    data = mujoco.MjData(model)
+    while data.time < 1:
+        mujoco.mj_step(model, data)
+    driven = {model.body(name).id for name in ("wheel_left", "wheel_right")}
+    load, force = 0.0, np.zeros(6)
+    for k, contact in enumerate(data.contact[: data.ncon]):
+        if driven & set(model.geom_bodyid[contact.geom]):
+            mujoco.mj_contactForce(model, data, k, force)
+            load += force[0]
+    assert load == pytest.approx((1 - robot.front_load) * robot.mass * 9.81, rel=0.01) and load < 0.4 * 64 * 9.81
+    assert robot.max_acceleration == pytest.approx(0.2 * robot.tyre_friction * load / robot.mass, rel=0.01)
+    # on the spot at both limits: the yaw moment from the two tyres, and across them the force on the centre of mass
+    inertia = robot.yaw_inertia + robot.mass * robot.com_offset**2
+    along = inertia * robot.max_rotation_acceleration / robot.half_track
+    along += robot.mass * robot.com_offset * robot.max_rotation**2
+    across = robot.mass * robot.com_offset * robot.max_rotation_acceleration
+    assert np.hypot(along, across) <= 0.5 * robot.tyre_friction * load * 1.01
+
+
 def test_perturbed(file):
     """A perturbation changes mass, motor, wheel and losses of an adopted robot."""
     _, model = read(file(document(DIFF, MOTORS)))

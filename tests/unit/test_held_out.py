@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, Scenario
-from mrctl.experiments import cases, held_out
+from mrctl.experiments import cases, held_out, results_page
 from mrctl.experiments.suite import Floor
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS
 from mrctl.loop.simulation import Simulation
@@ -54,6 +54,17 @@ def test_log_is_read_as_data(tmp_path: Path) -> None:
     assert not held_out._said(tmp_path, "fel")
     log.write_text('{"entry":"fel","says":"all"}\n{"entry": "rls"}\n')
     assert held_out._said(tmp_path, "fel") and not held_out._said(tmp_path, "rls")
+
+
+def test_a_line_of_the_log_that_was_cut_off(tmp_path: Path) -> None:
+    """What a killed process wrote in part is passed over, and the next line does not continue it."""
+    log = tmp_path / held_out.LOG_FILE
+    log.write_text('{"time": "t", "entry": "fel", "mrctl": "0", "says": "all"}\n{"entry": "fe')
+    assert held_out._said(tmp_path, "fel")
+    held_out._log(tmp_path, {"entry": "fel", "mrctl": "0"})
+    assert not held_out._said(tmp_path, "fel")
+    text = results_page.held_out_text("## Held-out cells\n\n| a |\n", log.read_text() + '{"ti')
+    assert text.endswith("fel, mrctl 0: begun")
 
 
 def test_cells_above_a_rival_are_named() -> None:
