@@ -159,14 +159,16 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
         most: Largest number of poses that the search makes.
 
     Raises:
-        InputError: The start or the goal is in an obstacle or off the map.
+        InputError: The start or the goal is not three finite numbers, or in an obstacle or off the map.
         NoWay: No way was found.
     """
     start, goal = np.asarray(start, float), np.asarray(goal, float)
-    low, high = where.area
     for name, pose in (("start", start), ("goal", goal)):
+        if pose.shape != (3,) or not np.isfinite(pose).all():
+            raise InputError(f"{name}: must be three finite numbers, not {tuple(pose.tolist())}")
         place = f"({pose[0]:.2f}, {pose[1]:.2f})"
-        if np.any(pose[:2] < low) or np.any(pose[:2] >= high):
+        if cell_of.compiled(pose, where)[0] < 0:
+            low, high = where.area
             raise InputError(f"{name}: {place} is off the map, which goes from {low.round(2)} to {high.round(2)}")
         if (free := clearance(where.footprint, pose, where.outlines)) <= where.margin:
             near = f"is {free:.3f} m from an obstacle, within the margin of {where.margin:g} m"

@@ -397,11 +397,15 @@ def test_begins_where_it_can():
         ((1.0, 1.0, 0), (0, 0, 0), r"start: the robot is in an obstacle at \(1.00, 1.00\)"),
         ((0, 0, 0), (0.86, 0.57, 0), r"goal: the robot is 0.0.* m from an obstacle, within the margin"),
         ((0, 0, 0), (9, 0, 0), r"goal: \(9.00, 0.00\) is off the map"),
+        ((0, 0, 0), (np.nextafter(4.0, 0.0), 0, 0), r"goal: \(4.00, 0.00\) is off the map"),  # in no cell
+        ((0, 0, np.nan), (2, 0, 0), r"start: must be three finite numbers"),
+        ((0, 0, 0), (np.nan, 0, 0), r"goal: must be three finite numbers"),
+        ((0, 0, 0), (2, 0), r"goal: must be three finite numbers"),
         ((0, 0, 0), (-2.9, -2.9, 0), r"goal: there is no way to \(-2.90, -2.90\)"),
     ],
 )
 def test_refused(start, goal, message):
-    """Poses in obstacles or off the map, and goals that cannot be reached, are refused with one line."""
+    """Poses in obstacles, off the map or not finite, and goals out of reach, are refused with one line."""
     fence = [Box(x=-2.75, y=-2.0, length=2.7, width=0.1), Box(x=-1.5, y=-3.0, length=0.1, width=2.2)]
     where = prepared(Obstacles(shapes=(Disc(x=1.3, y=1.0, radius=0.2), *fence)))
     with pytest.raises(InputError, match=message) as error:
