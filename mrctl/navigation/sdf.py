@@ -29,9 +29,10 @@ def read_sdf(path: str | Path) -> Obstacles:
         InputError: The file is no SDF world, a pose is relative to a frame that it names, or one of the shapes is a
             mesh or not upright.
     """
+    text = read_file(path)
     try:
-        world = ElementTree.fromstring(read_file(path)).find("world")
-    except ElementTree.ParseError as error:
+        world = ElementTree.fromstring(text).find("world")
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the last two: an encoding that is not read
         raise InputError(f"{path}: no SDF file, as it is not XML: {error}") from None
     if world is None:
         raise InputError(f"{path}: no SDF file with a <world>")
@@ -70,7 +71,7 @@ def _pose(element: ElementTree.Element) -> Array:
     if pose is not None and (frame := pose.get("relative_to")):
         raise InputError(f"{name}: pose: is relative to {frame}, and such poses are not read")
     try:
-        found = np.array([float(number) for number in text]).reshape(6)
+        found = np.array(_finite(text)).reshape(6)
     except ValueError:
         raise InputError(f"{name}: pose: {' '.join(text)!r} is not six numbers") from None
     if pose is not None and pose.get("degrees") in ("true", "1"):
@@ -85,6 +86,18 @@ def _after(base: Array, pose: Array) -> Array:
     return found
 
 
+def _finite(words: list[str]) -> list[float]:
+    """Returns words as numbers.
+
+    Raises:
+        ValueError: One is no finite number.
+    """
+    found = [float(word) for word in words]
+    if not np.isfinite(found).all():
+        raise ValueError
+    return found
+
+
 def _numbers(shape: ElementTree.Element, field: str, count: int, name: str) -> list[float]:
     """Returns the numbers in a field of a shape; `name` is that of the model.
 
@@ -92,7 +105,7 @@ def _numbers(shape: ElementTree.Element, field: str, count: int, name: str) -> l
         InputError: There is no such field, or it has not as many numbers.
     """
     try:
-        found = [float(number) for number in (shape.findtext(field) or "").split()]
+        found = _finite((shape.findtext(field) or "").split())
     except ValueError:
         found = []
     if len(found) != count:

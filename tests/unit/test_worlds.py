@@ -164,6 +164,10 @@ def test_sdf_lintel(tmp_path):
         ("<radius>0.075</radius>", "", "cylinder has no valid radius"),
         ("<length>1</length>", "<length>1 m</length>", "cylinder has no valid length"),
         ("<length>1</length>", "", "cylinder has no valid length"),
+        ("<length>1</length>", "<length>nan</length>", "cylinder has no valid length"),
+        ("0.5 0 0 0", "nan 0 0 0", "is not six numbers"),
+        ('version="1.0"', 'version="1.0" encoding="none"', "no SDF file, as it is not XML: unknown encoding: none"),
+        ('version="1.0"', 'version="1.0" encoding="shift_jis"', "no SDF file, as it is not XML: multi-byte encodings"),
     ],
 )
 def test_no_sdf(tmp_path, before, after, message):
