@@ -81,7 +81,7 @@ def order_of(folder: str | Path) -> Order:
         raise InputError(f"{folder}: holds no mission, as there is no mission.json in it")
     try:
         values = json.loads(read_file(path, MAX_BYTES))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise InputError(f"{path}: is not JSON") from None
     known = values if isinstance(values, dict) else {}
     return Order.from_dict({name: known[name] for name in Order.model_fields if name in known}, str(path))

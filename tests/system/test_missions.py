@@ -104,8 +104,9 @@ def test_changed_mission(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for broken in ({k: v for k, v in values.items() if k != "task"}, values | {"avoid": "luck"}, [1]):
         file.write_text(json.dumps(broken))
         assert str(file) in refused(capsys, "navigate", str(out))
-    file.write_text("{")
-    assert "is not JSON" in refused(capsys, "navigate", str(out))
+    for text in ("{", "[" * 100_000):
+        file.write_text(text)
+        assert "is not JSON" in refused(capsys, "navigate", str(out))
     file.unlink()
     assert "holds no mission" in refused(capsys, "navigate", str(out))
 
