@@ -172,8 +172,8 @@ def _driven(
     for k, (one, reference) in enumerate(zip(draws, references, strict=True)):
         run = result.isel(run=k).dropna("time", subset=["x"])
         there = reached(run, one.goal)
-        error = float(np.hypot(run["longitudinal_error"], run["lateral_error"]).max())
-        found.append(Run(there, reference.period, error if there else np.inf))
+        errors = np.hypot(run["longitudinal_error"].values, run["lateral_error"].values)
+        found.append(Run(there, reference.period, float(errors.max()) if there else np.inf))
     return found
 
 

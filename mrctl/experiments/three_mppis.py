@@ -169,7 +169,7 @@ def fitted(results: Sequence[xr.Dataset]) -> float:
     """Returns the time constant in s with which V follows its command in runs best, by least squares."""
     period = control_period(results[0])
     driven = [result.isel(run=0).dropna("time", subset=["v"]) for result in results]
-    pairs = [(one["v_command"].values, one["v"].values) for one in driven]
+    pairs = [(one["v_command"].values, one["v"].values) for one in driven if one.sizes["time"]]
 
     def missed(lag: float) -> float:
         left, total = np.exp(-period / lag), 0.0

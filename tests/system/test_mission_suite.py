@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -177,6 +178,24 @@ def test_learned_limits() -> None:
     assert np.abs(known / true - 1).min() > 0.15
 
 
+def test_failure_in_the_first_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that fails at once has not arrived, and its error is infinite, although there is no sample of it."""
+
+    class Bad:
+        def __init__(self, robot: object, size: int) -> None: ...
+
+        def reset(self, *_: object) -> None: ...
+
+        def output(self, *_: object) -> None:
+            raise ValueError
+
+    monkeypatch.setattr(feeding, "simulate", partial(simulate, motion=Bad))
+    draw = feeding.draw(Vehicle.of(Scenario()), 1.5 * float(np.ptp(HULL[:, 1])), 1.35, 1)
+    assert draw is not None
+    (run,) = feeding._driven(Scenario(learner="none"), [draw], [draw.reference], [None], 1)
+    assert not run.arrived and run.error == np.inf
+
+
 def test_worlds() -> None:
     """The discs cross the middle line where and about when a robot is there, and the plan does not know them."""
     base = Scenario()
@@ -206,7 +225,8 @@ def test_fitted_lag() -> None:
         result = xr.Dataset(
             {"v_command": (("run", "time"), command[None]), "v": (("run", "time"), v[None])}, {"time": times}
         )
-        assert three.fitted([result]) == pytest.approx(lag, rel=0.01)
+        failed = result.map(lambda values: np.nan * values)  # in its first tick, so that it has no sample
+        assert three.fitted([result, failed]) == pytest.approx(lag, rel=0.01)
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
