@@ -9,11 +9,13 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.navigation.steer import CHECK_SPACING
+from mrctl.record import InputError
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import Limits
 
+POINT_SPACING = 0.25  # m, about the distance of the points that the spline of a reference goes through
 MIN_CHORD = 1e-3  # m; the curvature at an end is computed as if its chord were at least that long
 NEARLY_STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
 
@@ -44,9 +46,7 @@ class Plan(NamedTuple):
         length = float(np.hypot(*np.diff(arc[:, :2], axis=0).T).sum())
         return self._replace(poses=poses, directions=directions, cost=self.cost + length)
 
-    def reference(
-        self, speed: float, limits: Limits, spacing: float = 0.25, velocity: float = 0.0, curvature: float = 0.0
-    ) -> Waypoints:
+    def reference(self, speed: float, limits: Limits, velocity: float = 0.0, curvature: float = 0.0) -> Waypoints:
         """Returns the plan as a reference: splines of continuous curvature, with the time law under all limits.
 
         It begins and ends with the headings of the plan, on arcs through the points next to its ends. Where the plan
@@ -55,17 +55,19 @@ class Plan(NamedTuple):
         Args:
             speed: Largest speed in m/s.
             limits: Limits of the time law, such as `Limits.of(robot)`.
-            spacing: Distance of the points that the spline goes through in m.
             velocity: V at the start in m/s; a plan that sets out in reverse begins at rest.
             curvature: Curvature at the start in 1/m where V is not zero; if it is not that of the plan, the heading is
                 off by up to 0.1 rad there.
 
         Raises:
-            InputError: The speed is not positive, or a spline turns too far from the plan at a change of direction.
+            InputError: The speed is not positive, the plan has no length, or a spline turns too far from the plan at a
+                change of direction.
         """
+        if len(self.poses) < 2:
+            raise InputError("plan: has no length, as it leads to where it starts")
         turns = np.flatnonzero(self.directions[2:] * self.directions[1:-1] < 0) + 1
         places = list(pairwise([0, *turns.tolist(), len(self.poses) - 1]))
-        legs = [_points(self.poses[a : b + 1], spacing, velocity > 0 and a == 0) for a, b in places]
+        legs = [_points(self.poses[a : b + 1], velocity > 0 and a == 0) for a, b in places]
         points = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
         cusps = np.cumsum([len(leg) - 1 for leg in legs[:-1]], dtype=int).tolist()
         start, *between, end = [
@@ -104,19 +106,18 @@ def run_out(start: Array, velocity: float, curvature: float, limits: Limits) -> 
     ])  # fmt: skip
 
 
-def _points(poses: Array, spacing: float, near: bool) -> Array:
-    """Returns points at equal distances of about the spacing in m along poses with arcs between them, `(n, 2)`.
+def _points(poses: Array, near: bool) -> Array:
+    """Returns points at equal distances of about `POINT_SPACING` along poses with arcs between them, `(n, 2)`.
 
     Args:
         poses: The poses.
-        spacing: The distance.
         near: Whether there is another point near the first, which holds the heading there.
     """
     chords, turns = np.diff(poses[:, :2] @ (1, 1j)), np.diff(poses[:, 2])
     turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
     lengths = np.abs(chords) / np.sinc(turns / (2 * np.pi))
     way = np.append(0, np.cumsum(lengths))
-    places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
+    places = np.linspace(0, way[-1], max(2, round(way[-1] / POINT_SPACING) + 1))
     if near and places[1] > 2 * CHECK_SPACING:
         places = np.insert(places, 1, CHECK_SPACING)
     arc = np.clip(np.searchsorted(way, places, side="right") - 1, 0, len(chords) - 1)

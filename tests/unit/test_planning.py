@@ -311,6 +311,14 @@ def test_reference():
     assert np.allclose(pose[:, -1], (-1, 0, 0), atol=1e-6)
 
 
+def test_no_reference():
+    """A plan from a pose to itself has no length, so that there is no reference along it."""
+    found = plan(prepared(Obstacles()), (0, 0, 0), (0, 0, 2 * np.pi), RADIUS, False)
+    assert found.length == 0
+    with pytest.raises(InputError, match="plan: has no length"):
+        found.reference(0.5, Limits())
+
+
 @pytest.mark.parametrize("reverse", [False, True])
 @settings(max_examples=30)
 @example(goal=(np.cos(0.4), np.sin(0.4), 0.4))
