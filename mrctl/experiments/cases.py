@@ -291,12 +291,17 @@ _KINDS = {
 
 def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
     """Draws a spline at changing speed; its lap time is the least of `LAP_TIMES` within the margins, or the next."""
-    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / SPLINE_LIMIT_SHARE})
     while True:
-        course = random_spline(random, careful, SPLINE_LIMIT_SHARE, SPLINE_LIMIT_SHARE)
+        course = careful_spline(random, robot)
         slower = int(random.integers(2))
         if times := [time for time in LAP_TIMES if time >= course.period]:
             return slowed(course, times[min(slower, len(times) - 1)])
+
+
+def careful_spline(random: np.random.Generator, robot: Robot) -> Waypoints:
+    """Draws a spline at changing speed that relies on little grip and keeps a margin from the robot's other limits."""
+    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / SPLINE_LIMIT_SHARE})
+    return random_spline(random, careful, SPLINE_LIMIT_SHARE, SPLINE_LIMIT_SHARE)
 
 
 def slowed(course: Waypoints, period: float) -> Waypoints:

@@ -39,7 +39,7 @@ from cmaes import CMA
 from tqdm import tqdm
 
 from mrctl.control.stages import Stages
-from mrctl.experiments.cases import RELIED_FRICTION, SPLINE_LIMIT_SHARE, TUNING_SEEDS, slowed
+from mrctl.experiments.cases import TUNING_SEEDS, careful_spline, slowed
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
 from mrctl.kernel import Array
@@ -53,7 +53,7 @@ from mrctl.results.comparison import paired_ratio
 from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, Scenario, replicates
 from mrctl.sensing.tiers import Sensing, Tier
-from mrctl.theory.references import Waypoints, random_spline
+from mrctl.theory.references import Waypoints
 
 Bounds = dict[str, tuple[float, float]]
 SEARCHED: dict[str, Bounds] = {
@@ -253,8 +253,7 @@ def world(tier: Tier, seed: int) -> Scenario:
 def _course(seed: int) -> Waypoints:
     """Draws a random spline with the margins of those in the suite, slowed down to the lap time."""
     random, robot = np.random.default_rng([seed, 8]), read_robot(mjcf.load())
-    careful = robot.model_copy(update={"tyre_friction": RELIED_FRICTION / SPLINE_LIMIT_SHARE})
-    while (course := random_spline(random, careful, SPLINE_LIMIT_SHARE, SPLINE_LIMIT_SHARE)).period > LAP_TIME:
+    while (course := careful_spline(random, robot)).period > LAP_TIME:
         pass
     return slowed(course, LAP_TIME)
 
