@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mrctl.control.stages import Stages
-from mrctl.experiments.tables import Report, markdown, number, output_folder
+from mrctl.experiments.tables import Report, json_text, markdown, number, output_folder
 from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.hindsight import best_fixed
@@ -118,14 +118,14 @@ def _as_json(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
         "versions": versions(),
         "failed": bool(failure),
         "failure": str(run["failure"].values),
-        "failure_time": float(run["failure_time"]) if failure else None,
-        "laps": [{name: _number(laps[name].values[k]) for name in metrics.METRICS} for k in range(laps.sizes["lap"])],
+        "failure_time": float(run["failure_time"]),  # NaN if it did not fail
+        "laps": [{name: float(laps[name].values[k]) for name in metrics.METRICS} for k in range(laps.sizes["lap"])],
         "faults": faults_of(run),
         "guard": metrics.guard_events(run).drop(columns="run").to_dict("records"),
         "retuned": _retuned(run),
         "feedforward_limited": _limited(run),
     }
-    return json.dumps(values, indent=1)
+    return json_text(values)
 
 
 def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | None, failure: str) -> str:
@@ -206,7 +206,3 @@ def _save(result: xr.Dataset, laps: xr.Dataset, out: Path | None) -> None:
 
     for name, function in FIGURES.items():
         plots.save(getattr(plots, function)(laps if name == "learning" else result), out, name)
-
-
-def _number(value: float) -> float | None:
-    return float(value) if abs(value) < float("inf") else None
