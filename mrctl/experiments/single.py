@@ -178,15 +178,16 @@ def _limited(run: xr.Dataset) -> list[str]:
 
 def _unreached(scenario: Scenario, run: xr.Dataset) -> list[str]:
     """Says which events of a scenario come after its end, and whether the robot stands at the goal, if it has one."""
-    end = scenario.ticks * scenario.control_period
-    late = [one.time for one in scenario.events if one.time >= end]
-    said = [f"event at {time:g} s: after the end of the run at {end:g} s" for time in late]
+    period, end = scenario.control_period, scenario.ticks * scenario.control_period
     last = run.dropna("time", subset=["x"]).isel(time=slice(-1, None))
-    if scenario.goal is None or not last.sizes["time"]:
-        return said
-    pose = np.stack([last[name].values for name in ("x", "y", "theta")], axis=-1)
-    there = arrived(pose, last["v"].values, np.array(scenario.goal))[0]
-    return [*said, f"goal: {'reached' if there else 'not reached'}, {float(last['time'][0]):.2f} s"]
+    stands = []
+    if scenario.goal is not None and last.sizes["time"]:
+        pose = np.stack([last[name].values for name in ("x", "y", "theta")], axis=-1)
+        there = arrived(pose, last["v"].values, np.array(scenario.goal))[0]
+        stands = [f"goal: {'reached' if there else 'not reached'}, {float(last['time'][0]):.2f} s"]
+        end = end if run["failure"].item() else float(last["time"][0]) + period  # a run ends where it arrives
+    late = [one.time for one in scenario.events if one.time >= end]
+    return [f"event at {time:g} s: after the end of the run at {end:g} s" for time in late] + stands
 
 
 def _written() -> list[str]:

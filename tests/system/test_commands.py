@@ -93,6 +93,17 @@ def test_run_json_is_the_simulation(capsys: pytest.CaptureFixture, scenario: Pat
     assert mrctl.Scenario.from_dict(printed["scenario"]) == mrctl.Scenario.from_toml(scenario)
 
 
+def test_event_after_the_arrival(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The report names an event that comes after the robot has arrived at its goal, where the run ends."""
+    line = mrctl.Waypoints(points=((0, 0), (0.2, 0), (0.4, 0)), closed=False, timing="limits", speed=0.5)
+    late = mrctl.Event(time=2.5, perturbation=mrctl.Perturbation(payload=1.0))
+    run = mrctl.Scenario(learner="none", laps=2, reference=line, goal=(0.4, 0.0, 0.0), events=(late,))
+    assert run.duration > late.time
+    (tmp_path / "run.toml").write_text(run.to_toml())
+    assert cli.main(["run", str(tmp_path / "run.toml")]) == 0
+    assert "event at 2.5 s: after the end of the run at 1." in capsys.readouterr().out
+
+
 def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) -> None:
     """Flags override the values of the file, and other values are the file's."""
     assert cli.main(["run", str(scenario), "--learner", "none", "--json"]) == 0
