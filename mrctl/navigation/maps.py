@@ -85,16 +85,17 @@ def read_map(path: str | Path) -> Map:
     Raises:
         InputError: The file is no map, or its image is missing, no image, or larger than 20 million pixels.
     """
+    content = read_file(path)
     try:
-        values = yaml.safe_load(read_file(path))
-    except (yaml.YAMLError, RecursionError) as error:
+        values = yaml.safe_load(content)
+    except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:  # as of a date that is none
         text = " ".join(str(error).replace('in "<byte string>", ', "").split())
         raise InputError(f"{path}: no yaml: {text}") from None
     if not isinstance(values, dict):
         raise InputError(f"{path}: no map: not a yaml file of fields such as image and resolution")
     others = [str(name) for name in values if name not in MapFile.model_fields]  # which tools add
     try:
-        file = MapFile.from_dict({k: v for k, v in values.items() if k not in others}, str(path))
+        file = MapFile.from_dict({k: v for k, v in values.items() if k in MapFile.model_fields}, str(path))
     except InputError as error:
         raise InputError(f"{error}; not known: {', '.join(others)}" if others else str(error)) from None
     if file.free_thresh >= file.occupied_thresh:

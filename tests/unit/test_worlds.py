@@ -78,6 +78,14 @@ def test_map_obstacles(tmp_path):
     assert found.symmetric_difference(expected).area < 1e-9
 
 
+def test_fields_of_tools(tmp_path):
+    """Fields that other tools have added are passed over, whatever their type."""
+    path = written(tmp_path)
+    expected = read_map(path).occupancy
+    path.write_text(f"{path.read_text()}1: 2\non: saved\nname: hall\n")
+    assert np.array_equal(read_map(path).occupancy, expected)
+
+
 def test_no_map(tmp_path):
     """What is no map is refused with one line that says why; an image of 10⁹ pixels before it is decoded."""
     path = written(tmp_path)
@@ -88,6 +96,8 @@ def test_no_map(tmp_path):
     cases["free_thresh: must be below"] = text.replace("0.196", "0.7")
     cases["no image that can be read"] = text.replace("map.pgm", "map.yaml")
     cases["mode: "] = text.replace("trinary", "guess")
+    cases["no yaml: month must be in"] = f"{text}made: 2025-19-01\n"
+    cases["no yaml: 'NoneType'"] = f"{text}made: !!timestamp today\n"
     cases["nowhere.pgm"] = text.replace("map.pgm", "nowhere.pgm")
     (tmp_path / "huge.pgm").write_bytes(b"P5 40000 25000 255\n")
     cases["huge.pgm: "] = text.replace("map.pgm", "huge.pgm")
