@@ -122,6 +122,7 @@ def figures(tmp_path: Path) -> Path:
         "parts": {"1": {"physics": 31.4}, "16": {"physics": 500.0}},
         "sensing_share": {"1": 0.05, "16": 0.03},
         "today": {"steps_per_second": 9884.0, "closed_loop_is_faster_by": 9.1},
+        "navigation": {"pairs": [], "plans": [], "missions": {"mppi": 7.25}},
     }
     (tmp_path / "bench.json").write_text(json.dumps(values))
     return tmp_path / "bench.json"
@@ -180,7 +181,8 @@ def test_sections(
     assert "\n\n### Three\n\nNone differs." in page["Three MPPIs"] and "### Up" in page["Feeding up"]
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
     assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
-    assert "| 0.912 |" in page["Speed"] and bench.text(json.loads(figures.read_text())) in page["Speed"]
+    assert "| 0.912 |" in page["Speed"] and "| mppi  | 7.25 " in page["Speed"]
+    assert bench.text(json.loads(figures.read_text())) in page["Speed"]
 
 
 def test_everything(
@@ -310,11 +312,15 @@ def test_refused(suite: Path, figures: Path, tmp_path: Path, capsys: pytest.Capt
     """One line for what is missing or was written by something else, and the page stays as it was."""
     out = tmp_path / "RESULTS.md"
     (tmp_path / "no.json").write_text("{")
+    older = json.loads(figures.read_text())
+    del older["navigation"]
+    (tmp_path / "older.json").write_text(json.dumps(older))
     for words, says in (
         ([], "name at least one input"),
         (["--suite", tmp_path / "none"], "none/table.json: cannot be read"),
         (["--bench", tmp_path / "no.json"], "no.json: Expecting"),
         (["--bench", suite / "table.json"], "table.json: has no robots"),
+        (["--bench", tmp_path / "older.json"], "older.json: has no navigation"),
     ):
         assert results_page.command([*map(str, words), "--out", str(out)]) == 2
         line = capsys.readouterr().err
