@@ -13,7 +13,9 @@ import pytest
 
 from mrctl import Box, Obstacles, cli
 from mrctl.experiments import bench, bench_navigation
+from mrctl.navigation.hybrid_astar import space
 from mrctl.physics.obstacles import multi_ray
+from mrctl.theory.obstacles import Surroundings
 
 sys.path.append(str(Path(__file__).parent))
 import long_sweep  # noqa: E402
@@ -84,6 +86,16 @@ def test_parts(figures):
         assert set(parts) == {*bench.PARTS, "the rest"}
         assert all(parts[name] > 0 for name in bench.PARTS)
         assert max(parts, key=parts.__getitem__) == "physics"
+
+
+def test_first_world_without_a_way():
+    """A plan counts, wherever it is in the list, and a world without one does not, be it the first."""
+    wall = Surroundings(Obstacles(shapes=(Box(x=1.0),))).at(0.0)
+    corners = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
+    where = space(wall, corners, np.full(2, -2.0), np.full(2, 2.0))
+    tried = [(where, np.zeros(3), np.array([x, 0.0, 0.0]), 0.3, False) for x in (1.0, -1.0, 0.2)]
+    row = bench_navigation._planned("three", tried)
+    assert row["worlds"] == 3 and row["found"] == 2 and row["cells"] == 1600
 
 
 def test_navigation(figures):
