@@ -19,7 +19,7 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines, Surroundings
-from mrctl.theory.references import MIN_SPEED, Waypoints, check
+from mrctl.theory.references import MAX_COORDINATE, MIN_SPEED, Waypoints, check
 from mrctl.theory.robot import ANY_ANGLE
 from mrctl.theory.timing import LIMIT_SHARE, Limits
 
@@ -70,11 +70,14 @@ class Query(NamedTuple):
     """Whether the robot keeps the plan in time, and does not go along it at its own pace."""
 
     def check(self) -> None:
-        """Refuses a margin or a speed that is out of range, and a robot that is at its goal.
+        """Refuses a margin, a speed or a place that is out of range, and a robot that is at its goal.
 
         Raises:
             InputError: The message says which.
         """
+        for name, (x, y, _) in (("start", self.task.start), ("goal", self.task.goal)):
+            if max(abs(x), abs(y)) > MAX_COORDINATE:
+                raise InputError(f"{name}: x and y must be between ±{MAX_COORDINATE:,} m, not {x:g} and {y:g}")
         if arrived(np.array(self.task.start), 0.0, np.array(self.task.goal)):
             raise InputError("goal: the robot starts there")
         if not 0 <= self.margin <= 10:
@@ -148,8 +151,9 @@ def planned(query: Query, *, reverse: bool = False, beyond: bool = False) -> tup
 
     Raises:
         NoWay: There is no way.
-        InputError: The margin or the speed is out of range, start or goal is within the margin of an obstacle or off
-            the map, the robot is at its goal, or it cannot drive the plan, or would touch an obstacle on it.
+        InputError: The margin or the speed is out of range, start or goal is within the margin of an obstacle, off the
+            map or out of range, the robot is at its goal, or it cannot drive the plan, or would touch an
+            obstacle on it.
     """
     query.check()
 

@@ -32,7 +32,8 @@ Length = Annotated[float, Field(ge=1e-3, le=1000)]
 MIN_SPEED = 0.01  # m/s, of a reference with a constant or a largest speed
 Speed = Annotated[float, Field(ge=MIN_SPEED, le=20)]
 Duration = Annotated[float, Field(ge=0.1, le=3600)]
-Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
+MAX_COORDINATE = 1000  # m, largest |x| and |y| of a point of a reference
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 EndCurvature = Annotated[float, Field(ge=-20, le=20)]
 
 # Polynomials that rise from 0 to 1 on (0, 1); the first 2 (quintic) or 3 (septic) derivatives vanish at both ends.

@@ -421,6 +421,13 @@ def test_refused(start, goal, message):
     assert "\n" not in str(error.value)
 
 
+def test_too_far_from_the_origin():
+    """A goal at which no reference can end is refused by its name, before a way to it is searched."""
+    task = Task(obstacles=Obstacles(), start=(998, 0, 0), goal=(1001, 0, 0))
+    with pytest.raises(InputError, match="^goal: x and y must be between ±1,000 m, not 1001 and 0"):
+        planned(Query(task, CAR))
+
+
 def test_nose_beyond_the_border():
     """Where the robot reaches beyond the area in which P may be, it keeps the margin from what is there, too."""
     random, sides, found = np.random.default_rng(0), np.empty((4, 4)), []
