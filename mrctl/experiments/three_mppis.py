@@ -56,7 +56,7 @@ WORLDS = {"quick": 4, "core": 30}
 GATES, SPACING = 2, 2.0  # of the slalom; m
 CROSSINGS = (3.0, 5.0)  # m, where the discs cross the way, on average
 DISC_RADIUS = 0.2  # m, of the discs
-MAX_LAG = 1.0  # s
+MAX_FITTED_LAG = 1.0  # s
 SIMULATED_PER_SECOND = 8  # simulated s in a s of one core
 TIE = REACTIVE_PERIOD
 
@@ -180,7 +180,7 @@ def fitted(results: Sequence[xr.Dataset]) -> float:
                 now = wanted + left * (now - wanted)
         return total
 
-    return float(fminbound(missed, 1e-3, MAX_LAG))  # pyright: ignore[reportArgumentType] (without full_output one number)
+    return float(fminbound(missed, 1e-3, MAX_FITTED_LAG))  # pyright: ignore[reportArgumentType] (without full_output one number)
 
 
 def ended(result: xr.Dataset, one: World) -> Run:

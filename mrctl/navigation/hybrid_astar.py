@@ -135,14 +135,15 @@ def wider(where: Space, goal: Array, room: float) -> Space:
     Raises:
         NoWay: The robot cannot leave the area from the goal, or the wider one has too many cells.
     """
-    (inner, outer), outlines, cell = where.area, where.outlines, where.field.resolution
-    corners = np.array([inner, outer, *(outlines.bounds if len(outlines.discs) or len(outlines.edges) else ())])
+    (inner_low, inner_high), outlines, cell = where.area, where.outlines, where.field.resolution
+    around = outlines.bounds if len(outlines.discs) or len(outlines.edges) else ()
+    corners = np.array([inner_low, inner_high, *around])
     low, high = corners.min(axis=0) - room - where.reach, corners.max(axis=0) + room + where.reach
     with contextlib.suppress(InputError):
         wide = space(outlines, where.footprint, low, high, cell, where.margin)
         rows, columns = np.nonzero(np.isfinite(cost_to_go(wide, goal)))
         reached = low + cell * np.column_stack([columns, rows])
-        if np.any((reached < inner - cell) | (reached > outer)):
+        if np.any((reached < inner_low - cell) | (reached > inner_high)):
             return wide
     raise NoWay(f"goal: there is no way to ({goal[0]:.2f}, {goal[1]:.2f})")
 
