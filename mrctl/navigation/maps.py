@@ -138,5 +138,5 @@ def _pixels(path: Path) -> Array:
         raise
     except UnidentifiedImageError:
         raise InputError(f"{path}: no image that can be read") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, TypeError, NotImplementedError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no image that can be read: {' '.join(str(error).split())}") from None

@@ -1,5 +1,7 @@
 """Worlds from files of other tools, and from generators."""
 
+import struct
+
 import numpy as np
 import pytest
 import shapely
@@ -103,6 +105,9 @@ def test_no_map(tmp_path):
     cases["huge.pgm: "] = text.replace("map.pgm", "huge.pgm")
     (tmp_path / "large.pgm").write_bytes(b"P5 10000 10000 255\n")
     cases["10000 by 10000 cells are more than"] = text.replace("map.pgm", "large.pgm")
+    head = struct.pack("<7I", 124, 0x1007, 4, 4, 8, 0, 1) + bytes(44) + struct.pack("<2I4s", 32, 4, b"none")
+    (tmp_path / "other.dds").write_bytes(b"DDS " + head + bytes(40))
+    cases["other.dds: no image that can be read: Unimplemented"] = text.replace("map.pgm", "other.dds")
     for message, content in cases.items():
         path.unlink(missing_ok=True)
         if content is not None:
