@@ -75,8 +75,8 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     """Returns limits on V, θ̇, V̇ and θ̈, in SI units, for a robot whose file has none, from its motors and its grip.
 
     The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
-    a sixth of the acceleration at stall, a half of the tyres' grip across, and a fifth of it along, which the driven
-    tyres alone have. Where nothing is steered, to turn on the spot takes at most half the grip of the driven tyres.
+    a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across. The driven tyres alone
+    accelerate the robot and, where nothing is steered, turn it on the spot: that takes at most half of their grip.
     """
     grip = robot.tyre_friction * robot.gravity
     speed = 0.64 * robot.velocity_gain * robot.supply
@@ -84,7 +84,7 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     if robot.steering_limit < ANY_ANGLE:
         rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
     stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
-    acceleration = min(stall / 6, 0.2 * grip * (1 - robot.front_load))
+    acceleration = min(stall / 6, 0.2 * grip, 0.5 * grip * (1 - robot.front_load))
     turning = 2 * rotation * acceleration / speed
     if robot.steering_limit >= ANY_ANGLE:
         limited = robot.model_copy(update={"max_rotation": rotation, "max_rotation_acceleration": turning})
