@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import nn
 from torch.func import functional_call, stack_module_state, vjp, vmap
 
 from mrctl.control.features import CHANNELS, FEATURES, feature_matrix, feature_scale
-from mrctl.control.fel import BIAS_GAIN, HEADING_GAIN, HIDDEN_GAIN, INPUTS, REGULARISATION, Fel, fresh
+from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, REGULARISATION, Fel, fresh
 from mrctl.control.matching import histories
 from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
@@ -39,16 +39,14 @@ class Network(nn.Module):
 class ModuleLearning:
     """Feedback-error learning of B copies of a torch module, with the update and safeguards of `fel`.
 
-    The output is scale · (f_W(x) − f_W₀(x) + W₄ h), so that learning begins as pure PID with any module. `simulate`
-    takes it as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`, and tells it the delay of the
-    loop. Under `rigid` steering it needs `rigid=True`, as a factory does not know the steering; without it the run is
-    refused.
+    The output is scale · (f_W(x) − f_W₀(x)), so that learning begins as pure PID with any module. `simulate` takes it
+    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`, and tells it the delay of the loop. Under
+    `rigid` steering it needs `rigid=True`, as a factory does not know the steering; without it the run is refused.
 
     Attributes:
         rigid: Whether the second channel is steering.
         state: Parameters W by name, each with a leading axis B.
-        incline: W₄, which the module does not have, `(B, 2, 2)`.
-        weight_norm: ‖W − W₀‖ with W₄, `(B,)`.
+        weight_norm: ‖W − W₀‖, `(B,)`.
     """
 
     def __init__(
@@ -84,24 +82,21 @@ class ModuleLearning:
             torch.tensor(start[name].copy()) for name in ("scale", "dead_zone", "share")
         )
         self._step, self._leak, self._bound = float(start["step"]), float(start["leak"]), float(start["bound"])
-        self._inputs = np.zeros((size, INPUTS))
-        self._queue, self._tick = histories(size, 0, INPUTS), np.zeros(size, int)
-        self._period, self._heading = 0.0, np.zeros(size)
+        self._features = np.zeros((size, FEATURES))
+        self._queue, self._tick = histories(size, 0, FEATURES), np.zeros(size, int)
         stacked, _ = stack_module_state([self._module] * size)
         self.initial = {name: value.detach().clone() for name, value in stacked.items()}
         self.state = {name: value.clone() for name, value in self.initial.items()}
-        self.incline = torch.zeros(size, CHANNELS, 2, dtype=torch.float64)
         self.weight_norm = np.zeros(size)
 
     def reset(self, period: float, delay: float) -> None:
         """Takes the control period and the delay of the loop in s; see `Feedforward.reset`."""
-        self._period, self._queue = period, histories(len(self._tick), round(delay / period), INPUTS)
+        self._queue = histories(len(self._tick), round(delay / period), FEATURES)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to the parameters of the module."""
         for name, value in self.state.items():
             value[rows] = self.initial[name][rows]
-        self.incline[rows] = 0.0
         self._tick[rows], self.weight_norm[rows] = 0, 0.0
 
     def adapted(self) -> dict[str, torch.Tensor]:
@@ -113,33 +108,25 @@ class ModuleLearning:
         for name, value in self.state.items():
             value[row] = torch.from_numpy(learned[name])
             self.initial[name][row] = torch.from_numpy(learned[f"initial.{name}"])
-        self.incline[row] = 0.0  # its heading counts from the start of a run
-        moved = [(value - self.initial[name])[[row]] for name, value in self.state.items()]
+        moved = {name: (value - self.initial[name])[[row]] for name, value in self.state.items()}
         self.weight_norm[row] = float(_square(moved).sqrt())
 
-    def _forward(self, parameters: dict[str, torch.Tensor], inputs: Array) -> torch.Tensor:
-        x = torch.from_numpy(np.ascontiguousarray(inputs[:, :FEATURES]))
+    def _forward(self, parameters: dict[str, torch.Tensor], features: Array) -> torch.Tensor:
+        x = torch.from_numpy(features)
         return vmap(lambda p, row: functional_call(self._module, p, (row,)))(parameters, x)
 
-    def _sloping(self, inputs: Array) -> torch.Tensor:
-        """Returns W₄ h, `(B, 2)`."""
-        return (self.incline @ torch.from_numpy(inputs[:, FEATURES:, None]))[..., 0]
-
     def output(self, command: Array, derivative: Array) -> Array:
-        """Returns the outputs of the modules at the commanded motion, and of W₄ at the heading."""
-        x = feature_matrix(command, derivative, self._half_track, self._scale)
-        h = HEADING_GAIN * np.column_stack([np.cos(self._heading), np.sin(self._heading)])
-        self._inputs = now = np.hstack([x, h])
+        """Returns the outputs of the modules at the commanded motion."""
+        self._features = x = feature_matrix(command, derivative, self._half_track, self._scale)
         with torch.no_grad():
-            learned = self._forward(self.state, now) - self._forward(self.initial, now) + self._sloping(now)
-            return (self._output_scale * learned).numpy()
+            return (self._output_scale * (self._forward(self.state, x) - self._forward(self.initial, x))).numpy()
 
     def learn(self, feedback: Array, frozen: Array, twist: Array, voltage: Array) -> Array:
         """Does the step of `fel.update` for all robots, with Jᵀe by automatic differentiation."""
         every, oldest = np.arange(len(self._tick)), self._tick % self._queue.shape[1]
         answered = self._tick >= self._queue.shape[1]
         past = self._queue[every, oldest]
-        self._queue[every, oldest] = self._inputs
+        self._queue[every, oldest] = self._features
         self._tick += 1
         fb = torch.from_numpy(np.array(feedback))
         error = torch.where(fb.abs() > self._dead_zone, self._share * fb / self._output_scale, 0.0)
@@ -148,34 +135,29 @@ class ModuleLearning:
         active = (power > 0) & allowed
         pull = vjp(lambda state: self._forward(state, past), self.state)[1]
         (gradient,) = pull(error)
-        incline = error[:, :, None] * torch.from_numpy(past[:, None, FEATURES:])
-        square = _square([*gradient.values(), incline])
+        square = _square(gradient)
         rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
         leak = self._leak * active.double()  # `where` of two plain numbers would be single precision
         moved = {
             name: self.state[name] + _like(rate, g) * g - _like(leak, g) * (self.state[name] - self.initial[name])
             for name, g in gradient.items()
         }
-        steeper = self.incline + _like(rate, incline) * incline - _like(leak, incline) * self.incline
-        distance = _square([*(moved[name] - self.initial[name] for name in moved), steeper]).sqrt()
+        distance = _square({name: moved[name] - self.initial[name] for name in moved}).sqrt()
         shrink = torch.where(active & (distance > self._bound), self._bound / distance.clamp_min(1e-300), 1.0)
         with torch.no_grad():
-            before = self._forward(self.state, self._inputs) + self._sloping(self._inputs)
+            before = self._forward(self.state, self._features)
         for name, value in moved.items():
             self.state[name] = self.initial[name] + (value - self.initial[name]) * _like(shrink, value)
-        self.incline = steeper * _like(shrink, steeper)
         norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
         self.weight_norm = norm.numpy()
-        self._heading += self._period * np.asarray(twist)[:, 1]
         with torch.no_grad():
-            after = self._forward(self.state, self._inputs) + self._sloping(self._inputs)
-            added = self._output_scale * (after - before)
+            added = self._output_scale * (self._forward(self.state, self._features) - before)
         return torch.where((norm >= self._bound)[:, None], 0.0, added).numpy()
 
 
-def _square(layers: Sequence[torch.Tensor]) -> torch.Tensor:
+def _square(layers: dict[str, torch.Tensor]) -> torch.Tensor:
     """Squared Euclidean norm of all parameters of each robot, `(B,)`."""
-    return torch.stack([(layer**2).reshape(len(layer), -1).sum(1) for layer in layers]).sum(0)
+    return torch.stack([(layer**2).reshape(len(layer), -1).sum(1) for layer in layers.values()]).sum(0)
 
 
 def _like(row: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
