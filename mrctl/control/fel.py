@@ -1,6 +1,11 @@
 """Feedback-error learning of the inverse dynamics with a small network: the paper's feedforward.
 
-    U_ff = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x),      Ẇ = γ (∂U_ff/∂W)ᵀ U_fb
+    U_ff = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x + W₄ h),      Ẇ = γ (∂U_ff/∂W)ᵀ U_fb
+
+x are the features of the commanded motion, and h = g_θ (cos θ, sin θ) is the heading, in which gravity along the robot
+is linear on a slope of any direction. The paper does not have it, and the network has it only on top of a model: where
+it has everything to learn, the heading would take a share of each step from what matters more. The heading is dead
+reckoning, so that W₄, unlike the other weights, belongs to one run; no file holds it.
 
 The feedback voltage U_fb is the teaching signal, so the network takes over the work that the feedback still does
 (Kawato, Furukawa and Suzuki 1987, Gomi and Kawato 1993). `update` is the normalised discrete step. Its gradient is
@@ -28,6 +33,8 @@ from mrctl.record import Record
 # proportion to their squared regressors, so these gains give most of it to the eight features. With gains of one, two
 # dozen nearly constant units act as an integrator, which learns slowly what changes during a lap, and soon oscillates.
 HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
+HEADING_GAIN = 0.4  # g_θ on top of a model; with a small one gravity is learned slowly, with 1 everything else is
+INPUTS = FEATURES + 2  # x and h
 REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the regressor vanishes
 
 
@@ -95,17 +102,18 @@ def inner(a: Array, start: int, b: Array) -> float:
 
 
 @kernel
-def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> None:
-    """The network: output = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x).
+def network(inputs: Array, w: Array, incline: Array, hidden: Array, scale: Array, output: Array) -> None:
+    """The network: output = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x + W₄ h).
 
     Args:
-        x: Scaled features, `(8,)`.
+        inputs: Scaled features x and heading h, `(10,)`.
         w: Flat weights, W₁ᵀ and then the layers at their `places`.
+        incline: W₄, `(2, 2)`.
         hidden: Out: tanh(W₁ x + b₁), `(units,)`.
         scale: Output for a network output of one, V (rad/s on a steering channel), `(2,)`.
         output: Out: feedforward of the two channels in the same units, `(2,)`.
     """
-    units = hidden.shape[0]
+    units, x = hidden.shape[0], inputs[:FEATURES]
     b1, W2, b2, W3 = places(units)
     for j in range(units):
         z = w[b1 + j]
@@ -114,26 +122,27 @@ def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> N
         hidden[j] = tanh(z)
     for k in range(CHANNELS):
         direct = inner(w, W3 + k * FEATURES, x)
+        direct += incline[k, 0] * inputs[FEATURES] + incline[k, 1] * inputs[FEATURES + 1]
         output[k] = scale[k] * (HIDDEN_GAIN * inner(w, W2 + k * units, hidden) + BIAS_GAIN * w[b2 + k] + direct)
 
 
 @kernel
-def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> float:
+def backpropagate(inputs: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> float:
     """Writes Jᵀe, with J = ∂(output/scale)/∂W of the network, in the order of the weights.
 
-        Jᵀe = (δ xᵀ, δ, g_h e hᵀ, g_b e, e xᵀ),    δ = g_h (1 − h²) ∘ W₂ᵀe,    h = tanh(W₁ x + b₁)
+        Jᵀe = (δ xᵀ, δ, g_h e aᵀ, g_b e, e xᵀ),    δ = g_h (1 − a²) ∘ W₂ᵀe,    a = tanh(W₁ x + b₁)
 
     Args:
-        x: Scaled features, `(8,)`.
+        inputs: Scaled features x and heading h, `(10,)`.
         w: Flat weights, `(n,)`.
-        hidden: Activations h at x, as from `network`, `(units,)`.
+        hidden: Activations a at x, as from `network`, `(units,)`.
         error: e, `(2,)`.
-        gradient: Out: Jᵀe, `(n,)`.
+        gradient: Out: Jᵀe, `(n,)`, but for W₄, where it is e hᵀ.
 
     Returns:
-        ‖Jᵀe‖², where the squared norm of an outer product is the product of those of its factors.
+        ‖Jᵀe‖² with W₄, where the squared norm of an outer product is the product of those of its factors.
     """
-    units = hidden.shape[0]
+    units, x = hidden.shape[0], inputs[:FEATURES]
     b1, W2, b2, W3 = places(units)
     for k in range(CHANNELS):
         gradient[b2 + k] = BIAS_GAIN * error[k]
@@ -148,9 +157,8 @@ def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Arr
         for j in range(units):
             gradient[i * units + j] = gradient[b1 + j] * x[i]
     delta = gradient[b1 : b1 + units]
-    inputs = inner(x, 0, x)
-    outer = BIAS_GAIN * BIAS_GAIN + inputs + HIDDEN_GAIN * HIDDEN_GAIN * inner(hidden, 0, hidden)
-    return inner(error, 0, error) * outer + inner(delta, 0, delta) * (1 + inputs)
+    outer = BIAS_GAIN * BIAS_GAIN + inner(inputs, 0, inputs) + HIDDEN_GAIN * HIDDEN_GAIN * inner(hidden, 0, hidden)
+    return inner(error, 0, error) * outer + inner(delta, 0, delta) * (1 + inner(x, 0, x))
 
 
 @kernel
@@ -165,8 +173,8 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
 
     Args:
         feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
-        s: In and out: a record of `FEL` with the features `x` of this tick, the network's `output` there, which is
-            renewed, and the delayed features `past`.
+        s: In and out: a record of `FEL` with the inputs `x` of this tick, the network's `output` there, which is
+            renewed, the delayed inputs `past`, and W₄, which W includes and which begins at zero.
         w: In and out: flat weights W, `(n,)`.
         initial: Initial weights W₀, `(n,)`.
         hidden: Scratch, `(units,)`.
@@ -178,19 +186,27 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
         power += s.error[k] * s.error[k]
     if power == 0:
         return
-    network(s.past, w, hidden, s.scale, s.output)
+    network(s.past, w, s.incline, hidden, s.scale, s.output)
     square = backpropagate(s.past, w, hidden, s.error, gradient)
     rate, leak = s.step / (square / power + REGULARISATION), s.leak
     distance = gradient  # from here on W − W₀, in the same memory
     for n in range(w.shape[0]):
         w[n] += rate * gradient[n] - leak * (w[n] - initial[n])
         distance[n] = w[n] - initial[n]
-    s.norm = np.sqrt(inner(distance, 0, distance))
+    total = inner(distance, 0, distance)
+    for k in range(CHANNELS):
+        for j in range(2):
+            s.incline[k, j] += rate * s.error[k] * s.past[FEATURES + j] - leak * s.incline[k, j]
+            total += s.incline[k, j] * s.incline[k, j]
+    s.norm = np.sqrt(total)
     if s.norm > s.bound:
         for n in range(w.shape[0]):
             w[n] = initial[n] + (w[n] - initial[n]) * s.bound / s.norm
+        for k in range(CHANNELS):
+            for j in range(2):
+                s.incline[k, j] *= s.bound / s.norm
         s.norm = s.bound
-    network(s.x, w, hidden, s.scale, s.output)
+    network(s.x, w, s.incline, hidden, s.scale, s.output)
 
 
 @kernel
@@ -199,7 +215,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     rows, scale, weights, _, hidden, _, _ = arrays
     s = rows[i]
     features(command, derivative, robot.half_track, scale, s.x)
-    network(s.x, weights[i], hidden[i], s.scale, s.output)
+    network(s.x, weights[i], s.incline, hidden[i], s.scale, s.output)
     voltage[0], voltage[1] = s.output[0], s.output[1]
 
 
@@ -219,6 +235,8 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
         update(shown.feedback, s, weights[i], initial[i], hidden[i], gradient)
         if s.norm < s.bound:
             added[0], added[1] = s.output[0] - before, s.output[1] - before_second
+    s.heading += shown.period * shown.twist[1]
+    s.x[FEATURES], s.x[FEATURES + 1] = s.heading_gain * np.cos(s.heading), s.heading_gain * np.sin(s.heading)
     return s.norm
 
 
@@ -254,18 +272,21 @@ FEL = np.dtype(
         ("step", "f8"),  # μ; 0 keeps the weights as they are
         ("leak", "f8"),  # share of W − W₀ that is subtracted with each step
         ("bound", "f8"),  # largest ‖W − W₀‖
-        ("x", "f8", FEATURES),  # scaled features of the commanded motion
+        ("x", "f8", INPUTS),  # scaled features of the commanded motion, and h
         ("output", "f8", CHANNELS),  # feedforward at x, V (rad/s)
         ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", FEATURES),  # delayed features: x of the output that the feedback answers
+        ("past", "f8", INPUTS),  # delayed inputs: those of the output that the feedback answers
         ("error", "f8", CHANNELS),  # e: feedback in units of the network's output
         ("norm", "f8"),  # ‖W − W₀‖
+        ("heading", "f8"),  # θ by dead reckoning from the start, rad
+        ("heading_gain", "f8"),  # g_θ; 0 without a model
+        ("incline", "f8", (CHANNELS, 2)),  # W₄
     ],
     align=True,
 )
 
 
-def fresh(settings: list[Fel], rigid: bool) -> Rows:
+def fresh(settings: list[Fel], rigid: bool, has_prior: bool = False) -> Rows:
     """Returns a record of `FEL` for each robot; `rigid` says whether channel two is steering."""
     rows = np.zeros(len(settings), FEL)
     second = STEERING_SCALE if rigid else 1.0
@@ -273,6 +294,7 @@ def fresh(settings: list[Fel], rigid: bool) -> Rows:
     rows["dead_zone"] = [(s.dead_zone, s.dead_zone * second) for s in settings]
     rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
     rows["step"] = [0.0 if s.frozen else s.step for s in settings]
+    rows["heading_gain"] = rows["x"][:, FEATURES] = HEADING_GAIN if has_prior else 0.0
     rows["leak"], rows["bound"] = [0.0 if s.frozen else s.leak for s in settings], [s.weight_bound for s in settings]
     return rows
 
@@ -281,9 +303,9 @@ class FeedbackErrorLearning(Learner):
     """The learner `fel` for B robots.
 
     Attributes:
-        weights: Flat weights W in the order of the kernels, `(B, n)`.
+        weights: Flat weights W but for W₄, in the order of the kernels, `(B, n)`.
         initial: Initial weights W₀, to which leak and projection refer, in the same order, `(B, n)`.
-        weight_norm: ‖W − W₀‖, `(B,)`.
+        weight_norm: ‖W − W₀‖, with W₄, `(B,)`.
     """
 
     respond, learn_one, record = respond, learn, FEL
@@ -301,9 +323,9 @@ class FeedbackErrorLearning(Learner):
         ]
         self.initial = by_columns(np.array(given))
         self.weights = self.initial.copy()
-        self.rows = fresh(settings, loop.rigid)
+        self.rows = fresh(settings, loop.rigid, loop.has_prior)
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
-        queue = histories(len(settings), loop.delay, FEATURES)
+        queue = histories(len(settings), loop.delay, INPUTS)
         self.arrays = self.rows, feature_scale(loop.robot), self.weights, self.initial, hidden, gradient, queue
 
     @classmethod
@@ -312,14 +334,15 @@ class FeedbackErrorLearning(Learner):
         return shapes(settings.hidden)
 
     def adapted(self) -> Array:
-        """The weights, `(B, n)`, in the order of files."""
+        """The weights but for W₄, `(B, n)`, in the order of files."""
         return by_rows(self.weights)
 
     def adopt(self, row: int, learned: Array) -> None:
-        """Starts one robot from other weights, to which leak and projection then refer."""
+        """Starts one robot from other weights, to which leak and projection then refer, and without W₄."""
+        self.rows["incline"][row] = 0.0
         self.weights[row] = self.initial[row] = by_columns(learned)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights."""
-        self.weights[rows] = self.initial[rows]
+        self.weights[rows], self.rows["incline"][rows] = self.initial[rows], 0.0
         self.rows["tick"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0, 0.0, 0.0

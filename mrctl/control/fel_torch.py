@@ -1,4 +1,7 @@
-"""Feedback-error learning with any stateless torch module, copied for each robot: the general form of `fel`."""
+"""Feedback-error learning with any stateless torch module, copied for each robot: the general form of `fel`.
+
+It is `fel` without a model, which has no links from the heading.
+"""
 
 from __future__ import annotations
 

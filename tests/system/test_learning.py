@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights
+from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Perturbation, Scenario, per_lap, save_weights
+from mrctl.control.fel import HEADING_GAIN
 from mrctl.control.weights import initial_weights, unflatten
 from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation, simulate
@@ -131,6 +132,27 @@ def test_torch_module(runs):
     learned = begun([BASE, variant(seed=1)], own, 600)
     assert not learned.failed.any() and float(learned.weight_norm[0, -1]) > 0
     assert rms(learned.feedback_left[0, 300:]) < rms(runs.feedback_left[1, 300:600])
+
+
+def test_slope():
+    """On a slope W₄ becomes gravity along the robot, and the errors fall below those of the model, which has no slope.
+
+    The lemniscate begins at 45°, from which the heading of the network counts: the voltage of gravity at an angle θ
+    from there is M g sin α r/(2 K_m) cos(θ + 45°), with the stall torque K_m of a drive per volt.
+    """
+    base = Scenario(laps=8, prior="model", perturbation=Perturbation(slope=0.1), initial_spread=(0, 0, 0))
+    simulation = Simulation([base.replace(learner="fel")])
+    while simulation.running:
+        simulation.step()
+    robot, fel = simulation.plant.robot, simulation.hierarchy.learner.rows[0]
+    gravity = robot.mass * robot.gravity * np.sin(0.1) * robot.wheel_radius / 2 / robot.motor_gain
+    learned = HEADING_GAIN * fel["scale"][0] * fel["incline"][0]
+    np.testing.assert_allclose(learned, gravity * np.sqrt(0.5) * np.array([1, -1]), rtol=0.1)
+    with_fel, without = (
+        per_lap(run)[["v_rmse", "position_rmse"]].isel(run=0, lap=-1).to_array().values
+        for run in (simulation.result(), simulate([base.replace(learner="none")]))
+    )
+    assert (with_fel < np.multiply([0.8, 0.9], without)).all(), (with_fel, without)
 
 
 def test_too_small_a_bound():

@@ -17,6 +17,7 @@ from mrctl.control.features import FEATURES, feature_matrix, feature_scale
 from mrctl.control.feedforward import Loop
 from mrctl.control.fel import (
     BIAS_GAIN,
+    HEADING_GAIN,
     HIDDEN_GAIN,
     REGULARISATION,
     FeedbackErrorLearning,
@@ -51,22 +52,36 @@ def torch_network(weights):
     return twin
 
 
+def whole(hidden=HIDDEN):
+    """All weights of the network, with W₄ at the end, flat."""
+    return np.append(trained(hidden), np.random.default_rng(1).normal(0, 0.5, 4))
+
+
+def apart(weights):
+    """The weights of the kernels, and W₄."""
+    return by_columns(weights[:-4]), weights[-4:].reshape(2, 2).copy()
+
+
 def answer(x, weights, scale):
-    """Output of the network `(2,)`."""
+    """Output of the network `(2,)` at features and heading, with W₄ at the end of the weights."""
     output = np.zeros(2)
-    network(x, by_columns(weights), np.zeros(HIDDEN), np.array(scale, float), output)
+    w, incline = apart(weights)
+    network(x, w, incline, np.zeros(HIDDEN), np.array(scale, float), output)
     return output
 
 
 def one_step(x, feedback, weights, rigid=False, prior=None, **settings):
-    """Weights and norm after one step of one robot, without leak and far within the bound by default."""
+    """Weights and norm after one step of one robot, without leak and far within the bound by default.
+
+    Their last four are W₄, whose prior is zero.
+    """
     s = fresh([Fel(**{"step": 0.05, "leak": 0.0, "weight_bound": 1e4} | settings)], rigid)[0]
-    after, hidden = by_columns(weights), np.zeros(HIDDEN)
-    initial = by_columns(weights if prior is None else prior)
+    after, s["incline"] = apart(weights)
+    hidden, initial = np.zeros(HIDDEN), by_columns((weights if prior is None else prior)[:-4])
     s["x"] = s["past"] = x
-    network(s["x"], after, hidden, s["scale"], s["output"])
-    update(np.array(feedback, float), s, after, initial, hidden, np.zeros(len(weights)))
-    return by_rows(after), float(s["norm"])
+    network(s["x"], after, s["incline"], hidden, s["scale"], s["output"])
+    update(np.array(feedback, float), s, after, initial, hidden, np.zeros(len(initial)))
+    return np.append(by_rows(after), s["incline"]), float(s["norm"])
 
 
 def teach(stage, feedback, frozen=0.0):
@@ -92,7 +107,7 @@ def taught(robot, settings=None, rigid=False, size=1):
 def power(stage):
     """Squared norm of the gradient of one channel at the first step, when only what is behind tanh can move."""
     layers, x = unflatten(stage.adapted()[0]), stage.rows["x"][0]
-    hidden = np.tanh(layers["hidden.weight"] @ x + layers["hidden.bias"])
+    hidden = np.tanh(layers["hidden.weight"] @ x[:FEATURES] + layers["hidden.bias"])
     return HIDDEN_GAIN**2 * hidden @ hidden + BIAS_GAIN**2 + x @ x
 
 
@@ -116,32 +131,34 @@ def test_inner(size, start, data):
 
 
 def test_network():
-    """The compiled network is its formula, and its torch twin."""
-    x, weights = RNG.normal(size=8), trained()
-    layer = unflatten(weights)
+    """The compiled network is its formula, and its torch twin, which has no heading."""
+    inputs, weights = RNG.normal(size=10), whole()
+    x, heading = inputs[:8], inputs[8:]
+    layer = unflatten(weights[:-4])
     hidden = np.tanh(layer["hidden.weight"] @ x + layer["hidden.bias"])
     expected = HIDDEN_GAIN * layer["output.weight"] @ hidden + BIAS_GAIN * layer["output.bias"]
-    scale = np.array([6.0, 0.6])
-    expected = scale * (expected + layer["direct.weight"] @ x)
-    found = answer(x, weights, scale)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    twin = torch_network(weights)(torch.tensor(x)).detach().numpy()
-    np.testing.assert_allclose(found, scale * twin, rtol=1e-12)
+    scale, incline = np.array([6.0, 0.6]), weights[-4:].reshape(2, 2) @ heading
+    expected = scale * (expected + layer["direct.weight"] @ x + incline)
+    found = answer(inputs, weights, scale)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+    twin = torch_network(weights[:-4])(torch.tensor(x)).detach().numpy()
+    np.testing.assert_allclose(found, scale * (twin + incline), rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("rigid", [False, True])
 def test_gradient(rigid):
     """The step goes along Jᵀe with the documented length, J by central differences and by autograd."""
-    x, weights, feedback = RNG.normal(size=8), trained(), np.array([1.3, -0.4])
+    x, weights, feedback = RNG.normal(size=10), whole(), np.array([1.3, -0.4])
     h = 1e-5
     nudges = h * np.eye(len(weights))
     numeric = [(answer(x, weights + nudge, [1, 1]) - answer(x, weights - nudge, [1, 1])) / (2 * h) for nudge in nudges]
     numeric = np.transpose(numeric)
-    twin = torch_network(weights)
-    by_name = torch.func.jacrev(lambda p: torch.func.functional_call(twin, p, (torch.tensor(x),)))(
+    twin = torch_network(weights[:-4])
+    by_name = torch.func.jacrev(lambda p: torch.func.functional_call(twin, p, (torch.tensor(x[:8]),)))(
         dict(twin.named_parameters())
     )
     auto = np.hstack([by_name[name].detach().numpy().reshape(2, -1) for name in shapes(HIDDEN)])
+    auto = np.hstack([auto, np.kron(np.eye(2), x[8:])])
     np.testing.assert_allclose(numeric, auto, atol=1e-8)
     # The steering channel learns a tenth as fast, and 0.6 rad/s count as 6 V.
     error = np.array([1.0, 0.1 if rigid else 1.0]) * feedback / [6.0, 0.6 if rigid else 6.0]
@@ -149,7 +166,7 @@ def test_gradient(rigid):
     expected = 0.05 * gradient / (gradient @ gradient / (error @ error) + REGULARISATION)
     after, norm = one_step(x, feedback, weights, rigid)
     np.testing.assert_allclose(after - weights, expected, atol=1e-14)
-    assert norm == pytest.approx(np.linalg.norm(expected))
+    assert norm == pytest.approx(np.linalg.norm([*expected[:-4], *after[-4:]]))  # W₄ began at zero
 
 
 @pytest.mark.parametrize("rigid", [False, True])
@@ -222,17 +239,17 @@ def test_frozen_settings(robot):
 
 def test_leak():
     """Each step gives back its share of the distance to the prior."""
-    x, weights = RNG.normal(size=8), trained()
-    prior = weights[::-1].copy()
+    x, weights = RNG.normal(size=10), whole()
+    prior = np.append(weights[-5::-1], np.zeros(4))
     plain, _ = one_step(x, [1.0, 1.0], weights, prior=prior)
     leaky, _ = one_step(x, [1.0, 1.0], weights, prior=prior, leak=0.01)
     np.testing.assert_allclose(leaky - plain, -0.01 * (weights - prior), atol=1e-14)
 
 
-@given(arrays(float, (10, 8), elements=st.floats(-2, 2)), st.floats(0.01, 3), st.floats(0.01, 1))
+@given(arrays(float, (10, 10), elements=st.floats(-2, 2)), st.floats(0.01, 3), st.floats(0.01, 1))
 def test_projection(inputs, bound, rate):
     """However long and wrongly it is taught, the weights stay within the bound of the prior."""
-    weights = prior = trained()
+    weights = prior = np.append(trained(), np.zeros(4))
     for x in inputs:
         weights, norm = one_step(x, [50.0, -80.0], weights, prior=prior, step=rate, weight_bound=bound)
         distance = np.linalg.norm(weights - prior)
@@ -242,7 +259,7 @@ def test_projection(inputs, bound, rate):
 
 def test_projection_keeps_direction():
     """Beyond the bound the step is shortened, not turned."""
-    x, weights = RNG.normal(size=8), trained()
+    x, weights = RNG.normal(size=10), np.append(trained(), np.zeros(4))
     free, norm = one_step(x, [5.0, 5.0], weights)
     short, bounded = one_step(x, [5.0, 5.0], weights, weight_bound=norm / 4)
     np.testing.assert_allclose(short - weights, (free - weights) / 4, atol=1e-15)
@@ -306,8 +323,8 @@ def test_files(robot, tmp_path, suffix):
         save_weights(path, weights)
     np.testing.assert_array_equal(load_weights(path, HIDDEN), weights)
     stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, weights=str(path)))
-    x = feature_matrix(command, derivative, robot.half_track, feature_scale(robot))
-    np.testing.assert_array_equal(stage.output(command, derivative)[0], answer(x[0], weights, [6, 6]))
+    x = np.append(feature_matrix(command, derivative, robot.half_track, feature_scale(robot)), [HEADING_GAIN, 0.0])
+    np.testing.assert_array_equal(stage.output(command, derivative)[0], answer(x, np.append(weights, [0] * 4), [6, 6]))
     np.testing.assert_array_equal(stage.adapted(), weights[None])
 
 

@@ -47,7 +47,8 @@ def test_twins(robot, settings, rigid, ticks):
     rng = np.random.default_rng(2)
     module = Network(HIDDEN)
     module.load_state_dict({k: torch.tensor(v) for k, v in unflatten(initial_weights(HIDDEN, 4)).items()})
-    compiled = FeedbackErrorLearning(Loop(robot, rigid, PERIOD, 2, seeds=[4] * SIZE), [settings] * SIZE)
+    loop = Loop(robot, rigid, PERIOD, 2, has_prior=False, seeds=[4] * SIZE)
+    compiled = FeedbackErrorLearning(loop, [settings] * SIZE)
     general = ModuleLearning(module, robot, SIZE, settings, rigid)
     general.reset(PERIOD, 2 * PERIOD)
     largest = 0.0
