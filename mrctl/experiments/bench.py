@@ -103,7 +103,7 @@ def run(
 
 
 def text(figures: dict[str, Any]) -> str:
-    """Returns the figures of `run` as Markdown."""
+    """Returns the figures of `run` as Markdown; those of earlier versions have no `navigation`."""
     machine, today = figures["machine"], figures["today"]
 
     def table(rows: list[dict[str, Any]]) -> str:
@@ -139,7 +139,7 @@ def text(figures: dict[str, Any]) -> str:
             f"the closed loop with one robot is {today['closed_loop_is_faster_by']:.1f} times as fast.",
             "µs a control period in `lab`:",
             markdown(["part", *(f"{size} robot{'s' * (size != '1')}" for size in sizes)], parts),
-            bench_navigation.text(figures["navigation"]),
+            *([bench_navigation.text(figures["navigation"])] if "navigation" in figures else []),
         ]
     )
 

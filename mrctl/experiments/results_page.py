@@ -382,7 +382,7 @@ def _identify_section(files: Sequence[Path]) -> str:
 
 
 def _bench_section(file: Path) -> str:
-    table = _read(file, "robots", "threads", "lab", "parts", "sensing_share", "today", "navigation")
+    table = _read(file, "robots", "threads", "lab", "parts", "sensing_share", "today")
     source = {"versions": {k: v for k, v in table["machine"].items() if k not in ("processor", "cores")}}
     return _section("mrctl bench", {**table, **source}, benchmark.text(dict(table)))
 

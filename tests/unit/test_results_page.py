@@ -312,15 +312,15 @@ def test_refused(suite: Path, figures: Path, tmp_path: Path, capsys: pytest.Capt
     """One line for what is missing or was written by something else, and the page stays as it was."""
     out = tmp_path / "RESULTS.md"
     (tmp_path / "no.json").write_text("{")
-    older = json.loads(figures.read_text())
-    del older["navigation"]
-    (tmp_path / "older.json").write_text(json.dumps(older))
+    partial = json.loads(figures.read_text())
+    del partial["lab"]
+    (tmp_path / "partial.json").write_text(json.dumps(partial))
     for words, says in (
         ([], "name at least one input"),
         (["--suite", tmp_path / "none"], "none/table.json: cannot be read"),
         (["--bench", tmp_path / "no.json"], "no.json: Expecting"),
         (["--bench", suite / "table.json"], "table.json: has no robots"),
-        (["--bench", tmp_path / "older.json"], "older.json: has no navigation"),
+        (["--bench", tmp_path / "partial.json"], "partial.json: has no lab"),
     ):
         assert results_page.command([*map(str, words), "--out", str(out)]) == 2
         line = capsys.readouterr().err
