@@ -235,8 +235,9 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
         update(shown.feedback, s, weights[i], initial[i], hidden[i], gradient)
         if s.norm < s.bound:
             added[0], added[1] = s.output[0] - before, s.output[1] - before_second
-    s.heading += shown.period * shown.twist[1]
-    s.x[FEATURES], s.x[FEATURES + 1] = s.heading_gain * np.cos(s.heading), s.heading_gain * np.sin(s.heading)
+    if s.heading_gain > 0:
+        s.heading += shown.period * shown.twist[1]
+        s.x[FEATURES], s.x[FEATURES + 1] = s.heading_gain * np.cos(s.heading), s.heading_gain * np.sin(s.heading)
     return s.norm
 
 
