@@ -35,7 +35,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import CHANNELS, FEATURES, STICTION_SPEED, feature_scale, features, symmetric_product
+from mrctl.control.features import (
+    CHANNELS,
+    FEATURES,
+    REGRESSORS,
+    STICTION_SPEED,
+    dead_reckoned,
+    feature_scale,
+    regressor,
+    symmetric_product,
+)
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown, explained
 from mrctl.control.matching import SETTLING_TIMES, histories, low_pass, recall, sent
 from mrctl.kernel import Array, Row, kernel
@@ -43,7 +52,6 @@ from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
-REGRESSORS = FEATURES + 2  # the eight of the inverse dynamics, and gravity on a slope
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt; it is smaller, since the geometry needs no motor
 OUTLIER_SIGMAS = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
 # s over which squared innovations are averaged, to detect a change of the plant
@@ -54,24 +62,6 @@ UNEXCITED = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller expla
 # 20 mrad/s in θ̇, behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER_GAIN = 300.0
 UNKNOWN_WEIGHT = 6.0  # V, standard deviation of the weights of the eight features without a model
-
-
-@kernel
-def composite_regressor(
-    twist: Array, rate: Array, direction: Array, half_track: float, scale: Array, phi: Array
-) -> None:
-    """The ten features φ of a motion, followed by a one for the disturbance.
-
-    Args:
-        twist: V in m/s and θ̇ in rad/s, `(2,)`.
-        rate: V̇ in m/s² and θ̈ in rad/s², `(2,)`.
-        direction: Cosine and sine of the heading, `(2,)`.
-        half_track: D in m.
-        scale: Scales of the first eight features, as from `feature_scale`, `(8,)`.
-        phi: Out: φ and 1, `(11,)`.
-    """
-    features(twist, rate, half_track, scale, phi[:FEATURES])
-    phi[FEATURES], phi[FEATURES + 1], phi[REGRESSORS] = direction[0], direction[1], 1.0
 
 
 @kernel
@@ -184,9 +174,8 @@ def filter_motion(shown: Shown, robot: Row, s: Row) -> None:
     The second difference of independent noise has six times the variance of that noise.
     """
     twist, now, once, twice = shown.twist, s.now, s.once, s.twice
-    s.heading += shown.period * twist[1]
     now.twist[0], now.twist[1] = twist[0], twist[1]
-    now.direction[0], now.direction[1] = np.cos(s.heading), np.sin(s.heading)
+    s.heading = dead_reckoned(s.heading, twist[1], shown.period, now.direction)
     filter_twice(now.voltage, once.voltage, twice.voltage, s.filter, s.age == 0)
     filter_twice(now.twist, once.twist, twice.twist, s.filter, s.age == 0)
     filter_twice(now.direction, once.direction, twice.direction, s.filter, s.age == 0)
@@ -206,7 +195,8 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     """U = φ(x_c)ᵀ a + d at the commanded motion x_c."""
     rows, scale, _ = arrays
     s = rows[i]
-    composite_regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
+    regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
+    s.phi_c[REGRESSORS] = 1.0
     for k in range(CHANNELS):
         voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, REGRESSORS]
 
@@ -225,7 +215,8 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
     motion = s.twice
     moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > STICTION_SPEED
     if moves and s.age > SETTLING_TIMES and shown.frozen == 0:
-        composite_regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
+        regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
+        s.phi[REGRESSORS] = 1.0
         explained(motion.twist, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
             s.residual[k] = motion.voltage[k] - s.residual[k]

@@ -1,4 +1,4 @@
-"""The 8 physical features in which the inverse of equation (3) is linear, and their scales."""
+"""The 8 physical features in which the inverse of equation (3) is linear, their scales, and the heading."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from mrctl.theory.robot import Robot
 
 FEATURE_NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
 # Kernels are compiled with these sizes, so they must stand in a file that holds kernels; see `mrctl.kernel`.
-FEATURES, CHANNELS = 8, 2  # the physical features, and the channels of the velocity controller
+# The physical features, the same with cosine and sine of the heading, and the channels of the velocity controller
+FEATURES, REGRESSORS, CHANNELS = 8, 10, 2
 SIGN_SPEED = 0.05  # m/s, width of the smooth sign function of the friction
 STICTION_SPEED = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
 
@@ -37,6 +38,33 @@ def features(command: Array, derivative: Array, half_track: float, scale: Array,
     x[5] = omega * omega / scale[5]
     x[6] = np.tanh((v - half_track * omega) / SIGN_SPEED) / scale[6]
     x[7] = np.tanh((v + half_track * omega) / SIGN_SPEED) / scale[7]
+
+
+@kernel
+def regressor(command: Array, derivative: Array, direction: Array, half_track: float, scale: Array, phi: Array) -> None:
+    """The 8 features, and cosine and sine of the heading, in which gravity on a slope of any direction is linear.
+
+    Args:
+        command: V in m/s and ω in rad/s, `(2,)`.
+        derivative: V̇ in m/s² and ω̇ in rad/s², `(2,)`.
+        direction: Cosine and sine of the heading, `(2,)`.
+        half_track: D in m.
+        scale: Scales of the 8 features, as from `feature_scale`, `(8,)`.
+        phi: Out: features and direction, `(10,)` or longer.
+    """
+    features(command, derivative, half_track, scale, phi[:FEATURES])
+    phi[FEATURES], phi[FEATURES + 1] = direction[0], direction[1]
+
+
+@kernel
+def dead_reckoned(heading: float, rate: float, period: float, direction: Array) -> float:
+    """Turns a heading on by `period` in s at `rate` in rad/s, and writes its cosine and sine to `direction`, `(2,)`.
+
+    Its origin does not matter to a law that learns the weights of both.
+    """
+    heading += period * rate
+    direction[0], direction[1] = np.cos(heading), np.sin(heading)
+    return heading
 
 
 @kernel

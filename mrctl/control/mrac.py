@@ -3,9 +3,11 @@
 Slotine and Li (1989), with the regressor at the commanded motion (Sadegh and Horowitz 1990), projection and switching
 σ-modification (Ioannou and Sun 1996, sections 4.4 and 8.4). Equation (3) is linear in parameters: each channel k is
 
-    U_k = φ(x, ẋ)ᵀ a_k = m_k ẋ_k + f_k(x),      x = (V, θ̇),  φ = the 8 scaled physical features
+    U_k = φ(x, ẋ)ᵀ a_k = m_k ẋ_k + f_k(x),      x = (V, θ̇),  φ = the 8 scaled physical features, cos θ and sin θ
 
-m_k is the parameter of the acceleration of channel k. The commanded motion x_c is the reference model. The law is
+m_k is the parameter of the acceleration of channel k. The last two parameters are gravity on a slope of any direction,
+with the heading θ by dead reckoning; without a model as prior they are left out. The commanded motion x_c is the
+reference model. The law is
 
     U_k = φ(x_c, ẋ_c)ᵀ â_k + K_k e_k + K_i,k z_k,       e = x_c − x,  ż = e                        (the PID)
     â̇_k = P [η_k φ(x_c, ẋ_c) e_k − w (wᵀ â_k − H U_k)/ρ² − σ (â_k − a_0)] + projection
@@ -17,6 +19,7 @@ m_k is the parameter of the acceleration of channel k. The commanded motion x_c 
   leaves some directions without excitation then ends the forgetting in all of them, and adaptation with it.)
 - σ = 0 while ‖â_k − a_0‖ ≤ R and grows linearly to σ_0 at 2 R; a_0 are the parameters of the prior, zero for `none`.
 - The projection keeps â_k in the ball of radius 2 R about a_0, by the nearest point of the ball in the metric P⁻¹.
+- φ_c and w have the same heading, that of the robot, so that gravity cancels in f_k(x_c) − f_k(x).
 
 **Theorem.** Let the robot obey the equation of each channel with constant parameters, ‖a_k − a_0‖ ≤ R, m_k > 0, without
 disturbance, saturation and delay, and let the feedback be stronger than what f takes from it: for some ε ≥ 0
@@ -64,14 +67,23 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.cholesky import factor, forward, solve
-from mrctl.control.features import FEATURES, STICTION_SPEED, feature_scale, features, linear, symmetric_product
+from mrctl.control.features import (
+    FEATURES,
+    REGRESSORS,
+    STICTION_SPEED,
+    dead_reckoned,
+    feature_scale,
+    linear,
+    regressor,
+    symmetric_product,
+)
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import MATCHED, SETTLING_TIMES, low_pass, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 
-SIGNALS = FEATURES + 2  # filtered signals: the features and the voltage of the two channels
+SIGNALS = REGRESSORS + 2  # filtered signals: the features, the direction, and the voltage of the two channels
 # largest number of steps of the projection; share by which its result may exceed the ball
 MAX_NEWTON_STEPS, PROJECTION_TOLERANCE = 100, 1e-6
 
@@ -87,18 +99,18 @@ def predict(s: Row) -> None:
     Args:
         s: In and out: a record of `MRAC`.
     """
-    for i in range(FEATURES):
-        for j in range(FEATURES):
+    for i in range(REGRESSORS):
+        for j in range(REGRESSORS):
             s.M[i, j] += s.w[i] * s.w[j] / s.r - s.forgetting * s.M[i, j]
         s.M[i, i] += s.forgetting * s.least
     factor(s.M, s.L)
-    solve(s.L, s.w, s.direction)
+    solve(s.L, s.w, s.product)
     for k in range(2):
         innovation = s.residual[k]
-        for i in range(FEATURES):
+        for i in range(REGRESSORS):
             innovation -= s.w[i] * s.b[i, k]
-        for i in range(FEATURES):
-            s.b[i, k] += s.direction[i] * innovation / s.r
+        for i in range(REGRESSORS):
+            s.b[i, k] += s.product[i] * innovation / s.r
 
 
 @kernel
@@ -109,9 +121,9 @@ def track(k: int, s: Row) -> None:
         k: Channel.
         s: In and out: a record of `MRAC`.
     """
-    solve(s.L, s.phi_c, s.direction)
-    for i in range(FEATURES):
-        s.b[i, k] += s.tracking[k] * s.direction[i] * s.error[k]
+    solve(s.L, s.phi_c, s.product)
+    for i in range(REGRESSORS):
+        s.b[i, k] += s.tracking[k] * s.product[i] * s.error[k]
 
 
 @kernel
@@ -130,11 +142,11 @@ def confine(k: int, s: Row) -> None:
     size = np.sqrt(dot(b, b))
     if size <= radius:
         return
-    solve(s.L, b, s.direction)
-    share = min(s.leak * min(size / radius - 1, 1.0), (size - radius) * size / dot(b, s.direction))
-    for i in range(FEATURES):
-        b[i] -= share * s.direction[i]
-    project(s.M, b, 2 * radius, s.shifted, s.direction)
+    solve(s.L, b, s.product)
+    share = min(s.leak * min(size / radius - 1, 1.0), (size - radius) * size / dot(b, s.product))
+    for i in range(REGRESSORS):
+        b[i] -= share * s.product[i]
+    project(s.M, b, 2 * radius, s.shifted, s.product)
 
 
 @kernel
@@ -197,22 +209,24 @@ def filter_motion(shown: Shown, queue: Rows, scale: Array, robot: Row, s: Row) -
         Whether the filters have forgotten how they began.
     """
     known = match(shown, robot.rigid, queue, s.matched)
-    for j in range(FEATURES):
+    for j in range(REGRESSORS):
         s.before[j] = s.x[j]
-    features(s.matched.twist, s.zero, robot.half_track, scale, s.x)
+    if s.has_heading > 0:
+        s.heading = dead_reckoned(s.heading, s.matched.twist[1], shown.period, s.direction)
+    regressor(s.matched.twist, s.zero, s.direction, robot.half_track, scale, s.x)
     if not known:
         return False
     for j in range(SIGNALS):
         if j == 2 or j == 3:
             signal = s.matched.rate[j - 2] / scale[j]
-        elif j < FEATURES:
+        elif j < REGRESSORS:
             signal = (s.x[j] + s.before[j]) / 2
         else:
-            signal = s.matched.acted[j - FEATURES]
+            signal = s.matched.acted[j - REGRESSORS]
         if s.age == 0:
             s.once[j] = s.twice[j] = signal
         low_pass(signal, j, s.share, s.once, s.twice)
-        if j < FEATURES:
+        if j < REGRESSORS:
             s.w[j] = s.twice[j]
     s.age += s.share
     return s.age > SETTLING_TIMES
@@ -223,7 +237,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     """U = φ(x_c, ẋ_c)ᵀ (â − a_0); the prior adds φ(x_c, ẋ_c)ᵀ a_0."""
     rows, scale, _ = arrays
     s = rows[i]
-    features(command, derivative, robot.half_track, scale, s.phi_c)
+    regressor(command, derivative, s.direction, robot.half_track, scale, s.phi_c)
     linear(s.phi_c, s.b, voltage)
 
 
@@ -239,7 +253,7 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
     if settled and moves and shown.frozen == 0:
         for k in range(2):
             s.error[k] = shown.command[k] - shown.twist[k]
-            s.residual[k] = s.twice[FEATURES + k]
+            s.residual[k] = s.twice[REGRESSORS + k]
             for j in range(FEATURES):
                 s.residual[k] -= s.w[j] * scale[j] * prior.c[j, k]
         if robot.rigid:
@@ -299,20 +313,23 @@ MRAC = np.dtype(
         ("matched", MATCHED),
         ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
         ("output", "f8", 2),  # φ(x_c, ẋ_c)ᵀ b after a step, V
-        ("x", "f8", FEATURES),  # scaled features of the measured twist without acceleration
-        ("before", "f8", FEATURES),  # the same one period ago
+        ("has_heading", "f8"),  # 1 where a model is the prior, else 0
+        ("heading", "f8"),  # by dead reckoning, rad
+        ("direction", "f8", 2),  # its cosine and sine; zero without a model
+        ("x", "f8", REGRESSORS),  # scaled features of the measured twist without acceleration, and the direction
+        ("before", "f8", REGRESSORS),  # the same one period ago
         ("once", "f8", SIGNALS),  # features and voltages after the first filter
         ("twice", "f8", SIGNALS),  # H of features and voltages
         ("age", "f8"),  # time since the filters began over T + h
-        ("w", "f8", FEATURES),  # filtered features
-        ("phi_c", "f8", FEATURES),  # scaled features of the commanded motion
+        ("w", "f8", REGRESSORS),  # filtered features
+        ("phi_c", "f8", REGRESSORS),  # scaled features of the commanded motion
         ("residual", "f8", 2),  # filtered voltage less that of the prior, V
         ("error", "f8", 2),  # x_c − x, m/s and rad/s
-        ("b", "f8", (FEATURES, 2)),  # â − a_0, V
-        ("M", "f8", (FEATURES, FEATURES)),  # P⁻¹, the inverse of the gain of least squares, 1/V²
-        ("L", "f8", (FEATURES, FEATURES)),  # its factor, M = L Lᵀ, 1/V
-        ("shifted", "f8", (FEATURES, FEATURES)),  # scratch of the projection, 1/V²
-        ("direction", "f8", FEATURES),  # scratch: P times a vector, V² and V
+        ("b", "f8", (REGRESSORS, 2)),  # â − a_0, V
+        ("M", "f8", (REGRESSORS, REGRESSORS)),  # P⁻¹, the inverse of the gain of least squares, 1/V²
+        ("L", "f8", (REGRESSORS, REGRESSORS)),  # its factor, M = L Lᵀ, 1/V
+        ("shifted", "f8", (REGRESSORS, REGRESSORS)),  # scratch of the projection, 1/V²
+        ("product", "f8", REGRESSORS),  # scratch: P times a vector, V² and V
         ("norm", "f8"),  # ‖â − a_0‖ of both channels, V
     ],
     align=True,
@@ -337,17 +354,27 @@ class ModelReferenceAdaptive(Learner):
         weight = np.array([emf[0], STEERING_SHARE if rigid else emf[1]])
         for row, s in zip(rows, settings, strict=True):
             row["r"], row["forgetting"] = s.noise**2 / period, min(period / s.memory, 0.5)
-            row["least"], row["M"] = s.spread**-2, s.spread**-2 * np.eye(FEATURES)
+            row["least"], row["M"] = s.spread**-2, s.spread**-2 * np.eye(REGRESSORS)
             row["tracking"] = s.tracking * period * weight
             row["leak"], row["radius"] = s.leak * period, s.radius * robot.supply * unit
             row["share"], row["hand_over"] = period / (period + s.filter), s.hand_over
+        rows["has_heading"] = rows["direction"][:, 0] = loop.has_prior
         self._start = rows.copy()
         self.arrays = rows, feature_scale(robot), queues(len(settings), loop.delay)
 
     @property
     def parameters(self) -> Array:
         """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
-        return self.rows["b"].copy()
+        return self.rows["b"][:, :FEATURES].copy()
+
+    def adopt(self, row: int, learned: Array) -> None:
+        """Does as `Learner.adopt`, but leaves out the slope, which belongs to another place."""
+        super().adopt(row, learned)
+        s, slope = self.rows[row], slice(FEATURES, None)
+        P = np.linalg.inv(s["M"])
+        s["b"][slope] = P[slope] = P[:, slope] = 0.0
+        P[range(FEATURES, REGRESSORS), range(FEATURES, REGRESSORS)] = 1 / s["least"]
+        s["M"] = np.linalg.inv(P)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to the parameters of the prior and P₀."""

@@ -1,4 +1,8 @@
-"""Recursive least squares on the 8 physical features, taught by the feedback voltage."""
+"""Recursive least squares on the 8 physical features and the heading, taught by the feedback voltage.
+
+The weights of cosine and sine of the heading are gravity on a slope of any direction. As in `fel`, they are there on
+top of a model alone: where everything has to be learned, they would take a share of each step from what matters more.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import FEATURES, feature_scale, features, linear, symmetric_product
+from mrctl.control.features import (
+    FEATURES,
+    REGRESSORS,
+    dead_reckoned,
+    feature_scale,
+    linear,
+    regressor,
+    symmetric_product,
+)
 from mrctl.control.feedforward import STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
@@ -26,7 +38,7 @@ def update(x: Array, feedback: Array, s: Row) -> None:
     bound. The second denominator limits xᵀ K, the share of e that moves into the output at x, to `step`.
 
     Args:
-        x: Scaled features `(8,)`.
+        x: Scaled features, and the heading, `(10,)`.
         feedback: e in V (rad/s on a steering channel), `(2,)`.
         s: In and out: a record of `RLS`.
     """
@@ -34,11 +46,11 @@ def update(x: Array, feedback: Array, s: Row) -> None:
         return
     symmetric_product(s.P, x, s.gain)
     power = 0.0
-    for i in range(FEATURES):
+    for i in range(REGRESSORS):
         power += x[i] * s.gain[i]
     total = max(1.0 + power, power / s.step)
-    for i in range(FEATURES):
-        for j in range(FEATURES):
+    for i in range(REGRESSORS):
+        for j in range(REGRESSORS):
             s.P[i, j] -= s.gain[i] * s.gain[j] / total
         if s.P[i, i] < s.bound:
             s.P[i, i] += s.drift
@@ -52,8 +64,9 @@ def update(x: Array, feedback: Array, s: Row) -> None:
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = θᵀ x at the commanded motion."""
     rows, scale, _ = arrays
-    features(command, derivative, robot.half_track, scale, rows[i].x)
-    linear(rows[i].x, rows[i].theta, voltage)
+    s = rows[i]
+    regressor(command, derivative, s.direction, robot.half_track, scale, s.x)
+    linear(s.x, s.theta, voltage)
 
 
 @kernel
@@ -68,6 +81,8 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
         linear(s.x, s.theta, added)
     added[0] -= before
     added[1] -= before_second
+    if s.has_heading > 0:
+        s.heading = dead_reckoned(s.heading, shown.twist[1], shown.period, s.direction)
     return s.norm
 
 
@@ -78,12 +93,15 @@ RLS = np.dtype(
         ("bound", "f8"),  # diagonal element of P above which it gains no more
         ("dead_zone", "f8"),  # feedback below which nothing is learned, V (rad/s on a steering channel)
         ("share", "f8", 2),  # factor on the gain in the two channels; a steering channel learns more slowly
-        ("x", "f8", 8),  # scaled features of the commanded motion
+        ("has_heading", "f8"),  # 1 where a model is the prior, else 0
+        ("heading", "f8"),  # by dead reckoning, rad
+        ("direction", "f8", 2),  # its cosine and sine; zero without a model
+        ("x", "f8", REGRESSORS),  # scaled features of the commanded motion, and the direction
         ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", 8),  # x of the output that the feedback answers
-        ("theta", "f8", (8, 2)),  # θ: coefficients of the features in the two channels, V
-        ("P", "f8", (8, 8)),  # covariance of θ over the variance of the feedback
-        ("gain", "f8", 8),  # P x
+        ("past", "f8", REGRESSORS),  # x of the output that the feedback answers
+        ("theta", "f8", (REGRESSORS, 2)),  # θ: coefficients of x in the two channels, V
+        ("P", "f8", (REGRESSORS, REGRESSORS)),  # covariance of θ over the variance of the feedback
+        ("gain", "f8", REGRESSORS),  # P x
         ("norm", "f8"),  # ‖θ‖, V
     ],
     align=True,
@@ -125,19 +143,23 @@ class RecursiveLeastSquares(Learner):
         rows["step"], rows["drift"] = [s.step for s in settings], [s.drift for s in settings]
         rows["bound"], rows["dead_zone"] = [s.covariance_bound for s in settings], [s.dead_zone for s in settings]
         rows["share"] = 1.0, STEERING_SHARE if loop.rigid else 1.0
-        self._covariance = np.array([s.initial_covariance * np.eye(8) for s in settings])
+        self._covariance = np.array([s.initial_covariance * np.eye(REGRESSORS) for s in settings])
         rows["P"] = self._covariance
-        self.arrays = rows, feature_scale(loop.robot), histories(len(settings), loop.delay, 8)
+        rows["has_heading"] = rows["direction"][:, 0] = loop.has_prior
+        self.arrays = rows, feature_scale(loop.robot), histories(len(settings), loop.delay, REGRESSORS)
 
     @property
     def parameters(self) -> Array:
         """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
-        return self.rows["theta"].copy()
+        return self.rows["theta"][:, :FEATURES].copy()
 
     def adopt(self, row: int, learned: Array) -> None:
-        """Starts one robot from other coefficients and their covariance."""
+        """Does as `Learner.adopt`, but leaves out the slope, which belongs to another place."""
         super().adopt(row, learned)
-        self.rows["norm"][row] = np.linalg.norm(self.rows["theta"][row])
+        s, slope = self.rows[row], slice(FEATURES, None)
+        s["theta"][slope] = s["P"][slope] = s["P"][:, slope] = 0.0
+        s["P"][slope] = self._covariance[row, slope]
+        s["norm"] = np.linalg.norm(s["theta"])
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to zero coefficients and the initial covariance."""

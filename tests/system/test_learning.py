@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Perturbation, Scenario, per_lap, save_weights
+from mrctl.control.features import FEATURES, REGRESSORS
 from mrctl.control.fel import HEADING_GAIN
 from mrctl.control.weights import initial_weights, unflatten
 from mrctl.experiments.paper import IDEAL
@@ -134,25 +135,34 @@ def test_torch_module(runs):
     assert rms(learned.feedback_left[0, 300:]) < rms(runs.feedback_left[1, 300:600])
 
 
-def test_slope():
-    """On a slope W₄ becomes gravity along the robot, and the errors fall below those of the model, which has no slope.
+INCLINES = {
+    "fel": lambda s: HEADING_GAIN * s["scale"][0] * s["incline"][0],
+    "rls": lambda s: s["theta"][FEATURES:, 0],
+    "mrac": lambda s: s["b"][FEATURES:, 0],
+    "composite": lambda s: s["a"][0, FEATURES:REGRESSORS],
+}
+"""Voltage that a learner has for the cosine and the sine of the heading, from its record."""
 
-    The lemniscate begins at 45°, from which the heading of the network counts: the voltage of gravity at an angle θ
+
+@pytest.mark.parametrize("learner", INCLINES)
+def test_slope(learner):
+    """On a slope it finds gravity along the robot, and the errors fall below those of the model, which has no slope.
+
+    The lemniscate begins at 45°, from which the heading of a learner counts: the voltage of gravity at an angle θ
     from there is M g sin α r/(2 K_m) cos(θ + 45°), with the stall torque K_m of a drive per volt.
     """
     base = Scenario(laps=8, prior="model", perturbation=Perturbation(slope=0.1), initial_spread=(0, 0, 0))
-    simulation = Simulation([base.replace(learner="fel")])
+    simulation = Simulation([base.replace(learner=learner)])
     while simulation.running:
         simulation.step()
-    robot, fel = simulation.plant.robot, simulation.hierarchy.learner.rows[0]
+    robot, row = simulation.plant.robot, simulation.hierarchy.learner.rows[0]
     gravity = robot.mass * robot.gravity * np.sin(0.1) * robot.wheel_radius / 2 / robot.motor_gain
-    learned = HEADING_GAIN * fel["scale"][0] * fel["incline"][0]
-    np.testing.assert_allclose(learned, gravity * np.sqrt(0.5) * np.array([1, -1]), rtol=0.1)
-    with_fel, without = (
+    np.testing.assert_allclose(INCLINES[learner](row), gravity * np.sqrt(0.5) * np.array([1, -1]), rtol=0.1)
+    learning, without = (
         per_lap(run)[["v_rmse", "position_rmse"]].isel(run=0, lap=-1).to_array().values
         for run in (simulation.result(), simulate([base.replace(learner="none")]))
     )
-    assert (with_fel < np.multiply([0.8, 0.9], without)).all(), (with_fel, without)
+    assert (learning < np.multiply([0.8, 0.9], without)).all(), (learning, without)
 
 
 def test_too_small_a_bound():

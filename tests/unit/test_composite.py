@@ -8,16 +8,14 @@ from hypothesis.extra.numpy import arrays
 
 from mrctl.control.composite import (
     COMPOSITE,
-    REGRESSORS,
     SCATTER_GAIN,
     STEERING_DISTURBANCE,
     Composite,
     CompositeAdaptation,
-    composite_regressor,
     predict,
     track,
 )
-from mrctl.control.features import feature_scale
+from mrctl.control.features import REGRESSORS, feature_scale, regressor
 from mrctl.control.feedforward import STEERING_SCALE, Loop, NoLearner, Prior
 from mrctl.theory import dynamics
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
@@ -112,12 +110,12 @@ def test_outlier():
 
 @given(numbers(2), numbers(2), st.floats(-10, 10))
 def test_regressor(robot, twist, rate, heading):
-    """φ is the regressor of equation (3) over its scales, the direction of the heading, and a one."""
-    scale, phi = feature_scale(robot), np.empty(N + 1)
+    """φ is the regressor of equation (3) over its scales, and the direction of the heading."""
+    scale, phi = feature_scale(robot), np.empty(N)
     direction = np.array([np.cos(heading), np.sin(heading)])
-    composite_regressor(twist, rate, direction, robot.half_track, scale, phi)
+    regressor(twist, rate, direction, robot.half_track, scale, phi)
     expected = dynamics.regressor(twist, rate, robot, sign_speed=0.05) / scale
-    np.testing.assert_allclose(phi, [*expected, *direction, 1], atol=1e-14)
+    np.testing.assert_allclose(phi, [*expected, *direction], atol=1e-14)
 
 
 def stage(robot, size=1, rigid=False, **settings):

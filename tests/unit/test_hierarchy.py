@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mrctl.control.composite import REGRESSORS, CompositeAdaptation
+from mrctl.control.composite import CompositeAdaptation
+from mrctl.control.features import REGRESSORS
 from mrctl.control.feedforward import NoLearner, Prior
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.guard import Guard

@@ -66,7 +66,7 @@ def saved(result, tmp_path_factory):
 
 def test_labels(result):
     """Dimensions, units, coordinates and attributes that everything else relies on."""
-    assert result.sizes == {"run": 3, "time": 500, "weight": 80, "feature": 8, "channel": 2}
+    assert result.sizes == {"run": 3, "time": 500, "weight": 120, "feature": 8, "channel": 2}
     for name, (unit, meaning) in SIGNALS.items():
         assert result[name].dims == ("run", "time") and result[name].attrs == {"units": unit, "long_name": meaning}
     assert result.time.attrs == {"units": "s"} and np.array_equal(result.time, 0.01 * np.arange(500))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.control.features import feature_matrix, feature_scale
+from mrctl.control.features import FEATURES, REGRESSORS, feature_matrix, feature_scale
 from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.matching import HOLD_PERIODS
 from mrctl.control.rls import RLS, RecursiveLeastSquares, Rls, update
@@ -14,6 +14,7 @@ from mrctl.theory.dynamics import inverse_coefficients
 
 PERIOD = 0.01
 RNG = np.random.default_rng(5)
+N = REGRESSORS
 
 
 def draw(size):
@@ -34,9 +35,15 @@ def record(drift, bound, dead_zone, second, step, covariance, coefficients=0.0):
 
 
 def learn(stage, feedback, saturated=0.0):
-    """One step of a stage, which reads neither the measured twist nor the voltage."""
-    unused = np.full(np.shape(feedback), np.nan)
-    return stage.learn(np.asarray(feedback, float), np.broadcast_to(saturated, len(feedback)), unused, unused)
+    """One step of a stage, which does not read the voltage; the robot does not turn."""
+    twist, unused = np.zeros(np.shape(feedback)), np.full(np.shape(feedback), np.nan)
+    return stage.learn(np.asarray(feedback, float), np.broadcast_to(saturated, len(feedback)), twist, unused)
+
+
+def inputs(command, derivative, robot):
+    """Scaled features (n, 10) of a robot that has not turned."""
+    x = feature_matrix(command, derivative, robot.half_track, feature_scale(robot))
+    return np.hstack([x, np.broadcast_to([1.0, 0.0], (len(x), 2))])
 
 
 def drive(stage, command, derivative):
@@ -48,18 +55,18 @@ def drive(stage, command, derivative):
     return stage
 
 
-@given(numbers(8), numbers(8, 8, bound=1.0), numbers(8, 2), numbers(2), st.floats(0, 0.1), st.floats(0.05, 1))
+@given(numbers(N), numbers(N, N, bound=1.0), numbers(N, 2), numbers(2), st.floats(0, 0.1), st.floats(0.05, 1))
 def test_kalman(x, root, coefficients, feedback, drift, step_size):
     """One step is the Kalman filter of a random walk: K = P x/(R + xᵀP x), θ + K e, (I − K xᵀ) P + Q.
 
     R is 1, or what makes xᵀK the largest step that is allowed.
     """
-    covariance = root @ root.T + 0.01 * np.eye(8)
+    covariance = root @ root.T + 0.01 * np.eye(N)
     covariance = (covariance + covariance.T) / 2
     power = x @ covariance @ x
     noise = max(1.0, power * (1 / step_size - 1))
     gain = covariance @ x / (noise + power)
-    posterior = (np.eye(8) - np.outer(gain, x)) @ covariance
+    posterior = (np.eye(N) - np.outer(gain, x)) @ covariance
     feedback += np.where(feedback < 0, -0.1, 0.1)  # outside the dead zone
     s = record(drift, 1.5, 0.05, 0.3, step_size, covariance, coefficients)
     update(x, feedback, s)
@@ -76,18 +83,19 @@ def test_learns_physics(robot):
     teacher = Prior([robot] * 2, rigid=False)
     eager = Rls(step=1, initial_covariance=1000, drift=0, covariance_bound=1e-9, dead_zone=0)
     pupil = RecursiveLeastSquares(Loop(robot, False, PERIOD), [eager] * 2)
-    scale, first, driven = feature_scale(robot), None, []
+    first, driven = None, []
     for _ in range(200):
         driven.append(draw(2))
         pupil.output(*driven[-1])
         answered = driven[-HOLD_PERIODS - 1] if len(driven) > HOLD_PERIODS else driven[0]
-        x = feature_matrix(*answered, robot.half_track, scale)
-        missing = teacher.output(*answered) - np.einsum("bi,bik->bk", x, pupil.rows["theta"])
+        taught = np.einsum("bi,bik->bk", inputs(*answered, robot), pupil.rows["theta"])
+        missing = teacher.output(*answered) - taught
         first = np.abs(missing).max() if first is None else first
         learn(pupil, missing)
     assert first > 1
     expected = inverse_coefficients(robot) * feature_scale(robot)[:, None]
-    np.testing.assert_allclose(pupil.rows["theta"], [expected] * 2, atol=2e-3)
+    np.testing.assert_allclose(pupil.parameters, [expected] * 2, atol=2e-3)
+    np.testing.assert_allclose(pupil.rows["theta"][:, FEATURES:], 0, atol=2e-3)
     np.testing.assert_allclose(pupil.weight_norm, np.linalg.norm(expected), rtol=1e-3)
 
 
@@ -95,9 +103,8 @@ def test_output(robot):
     """It begins with nothing; later it is the features times the coefficients."""
     stage, (command, derivative) = RecursiveLeastSquares(Loop(robot, False, PERIOD), [Rls()] * 3), draw(3)
     assert not stage.output(command, derivative).any()
-    stage.rows["theta"][:] = RNG.normal(size=(3, 8, 2))
-    x = feature_matrix(command, derivative, robot.half_track, feature_scale(robot))
-    expected = np.einsum("bi,bik->bk", x, stage.rows["theta"])
+    stage.rows["theta"][:] = RNG.normal(size=(3, N, 2))
+    expected = np.einsum("bi,bik->bk", inputs(command, derivative, robot), stage.rows["theta"])
     np.testing.assert_allclose(stage.output(command, derivative), expected, atol=1e-12)
 
 
@@ -105,19 +112,19 @@ def test_output(robot):
 def test_frozen(robot, feedback, saturated):
     """A voltage that did not act, or feedback within the dead zone, teaches nothing."""
     settings = Rls(step=0.05, initial_covariance=0.05, drift=1e-3, covariance_bound=0.5, dead_zone=0.02)
-    stage, coefficients = RecursiveLeastSquares(Loop(robot, False, PERIOD), [settings]), RNG.normal(size=(8, 2))
+    stage, coefficients = RecursiveLeastSquares(Loop(robot, False, PERIOD), [settings]), RNG.normal(size=(N, 2))
     drive(stage, *draw(1))
     stage.rows["theta"] = coefficients
     assert not learn(stage, [feedback], saturated).any()
     np.testing.assert_array_equal(stage.rows["theta"][0], coefficients)
-    np.testing.assert_array_equal(stage.rows["P"][0], 0.05 * np.eye(8))
+    np.testing.assert_array_equal(stage.rows["P"][0], 0.05 * np.eye(N))
     assert learn(stage, [[2.0, -3.0]]).all()  # else it learns
 
 
 def test_dead_zone_of_a_channel():
     """A channel within the dead zone keeps its coefficients while the other learns."""
-    s = record(0.0, 0.05, 0.02, 1.0, 0.05, 0.05 * np.eye(8))
-    update(np.ones(8), np.array([0.01, 1.0]), s)
+    s = record(0.0, 0.05, 0.02, 1.0, 0.05, 0.05 * np.eye(N))
+    update(np.ones(N), np.array([0.01, 1.0]), s)
     assert not s["theta"][:, 0].any()
     assert s["theta"][:, 1].all()
 
@@ -146,10 +153,10 @@ def test_step(robot, command, derivative, share, initial):
     assert (moved <= share * (1 + 1e-9)).all()
 
 
-@given(numbers(60, 8), st.floats(0, 1e-2), st.floats(1e-3, 1), st.floats(1e-3, 1e3))
+@given(numbers(60, N), st.floats(0, 1e-2), st.floats(1e-3, 1), st.floats(1e-3, 1e3))
 def test_covariance(inputs, drift, bound, initial):
     """Through any inputs the covariance stays symmetric, positive definite and bounded."""
-    s = record(drift, bound, 0.0, 1.0, 0.05, initial * np.eye(8))
+    s = record(drift, bound, 0.0, 1.0, 0.05, initial * np.eye(N))
     for x in inputs:
         update(x, np.ones(2), s)
     covariance = s["P"]
@@ -160,9 +167,9 @@ def test_covariance(inputs, drift, bound, initial):
 
 def test_no_excitation():
     """At rest, where the regressor vanishes, the covariance grows to its bound and no further."""
-    s = record(1e-3, 0.05, 0.0, 1.0, 0.05, 0.01 * np.eye(8))
+    s = record(1e-3, 0.05, 0.0, 1.0, 0.05, 0.01 * np.eye(N))
     for _ in range(500):
-        update(np.zeros(8), np.ones(2), s)
+        update(np.zeros(N), np.ones(2), s)
     covariance = s["P"]
     np.testing.assert_allclose(covariance, np.diag(np.diag(covariance)))
     assert (np.diag(covariance) >= 0.05).all()
@@ -171,7 +178,7 @@ def test_no_excitation():
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
-@given(numbers(4, 8), numbers(4, 2), arrays(float, 4, elements=st.sampled_from([0.0, 1.0])), numbers(4, 8, 2))
+@given(numbers(4, N), numbers(4, 2), arrays(float, 4, elements=st.sampled_from([0.0, 1.0])), numbers(4, N, 2))
 def test_rows(robot, x, feedback, saturated, coefficients):
     """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
     settings = Rls(step=0.05, initial_covariance=0.05, drift=1e-3, covariance_bound=0.05, dead_zone=0.02)
