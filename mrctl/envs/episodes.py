@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
-from mrctl.loop.simulation import Simulation, group_of
+from mrctl.loop.simulation import Simulation
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
@@ -135,11 +135,6 @@ class Episodes:
         first = scenarios[0]
         if action not in ACTION_KINDS:
             raise InputError(f"action: {action!r} is not {', '.join(ACTION_KINDS)}")
-        if len(set(map(group_of, scenarios))) > 1:
-            raise InputError(
-                "scenarios: differ in world, robot, steering, laws, estimator, delay, length, rates, or in the number "
-                "of moving obstacles or of corners of polygons"
-            )
         if len(scenarios) > 1 and first.motion_period != first.control_period:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
         if action == "voltage":  # a learner must not learn from feedback that does not act

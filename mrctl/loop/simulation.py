@@ -239,6 +239,24 @@ def group_of(s: Scenario) -> Hashable:
     return s.world, walls.layout(s.obstacles), s.robot, s.steering, *laws, *rates, *chain
 
 
+def _together(scenarios: Sequence[Scenario]) -> list[Scenario]:
+    """Returns the scenarios of one simulation, `arranged`.
+
+    Raises:
+        InputError: They are not scenarios of one group; the message names the fields in which two of them differ.
+    """
+    if not (isinstance(scenarios, Sequence) and scenarios and all(isinstance(s, Scenario) for s in scenarios)):
+        raise InputError("scenarios: must be a list of one or more scenarios")
+    found = [arranged(s) for s in scenarios]
+    first, group = found[0], group_of(found[0])
+    for row, s in enumerate(found):
+        if group_of(s) != group:
+            fields = {name: getattr(s, name) for name in Scenario.model_fields}
+            apart = [n for n, value in fields.items() if group_of(first.model_copy(update={n: value})) != group]
+            raise InputError(f"scenarios: 0 and {row} differ in {', '.join(apart)}, and cannot run in one simulation")
+    return found
+
+
 class Simulation:
     """A uniform group of runs, one control period at a time.
 
@@ -276,7 +294,7 @@ class Simulation:
         from mrctl.loop.announcement import announced  # imported here because it needs Numba
 
         announced()
-        self.scenarios = scenarios = [arranged(s) for s in scenarios]
+        self.scenarios = scenarios = _together(scenarios)
         first, size = scenarios[0], len(scenarios)
         self.ticks, self.tick, self.period = max(s.ticks for s in scenarios), 0, first.control_period
         obstacles = [s.obstacles for s in scenarios]

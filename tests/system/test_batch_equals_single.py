@@ -194,7 +194,7 @@ def equal(one, whole, run: int) -> None:
 def test_plants(scenarios):
     """One run goes through dm_control, several through the batch engine."""
     assert isinstance(Simulation(scenarios[:1]).plant, PhysicsPlant)
-    assert isinstance(Simulation([scenarios[0], scenarios[3]]).plant, BatchPlant)
+    assert isinstance(Simulation(scenarios[:1] * 2).plant, BatchPlant)
 
 
 def test_scenarios_differ(scenarios, alone):
@@ -332,3 +332,13 @@ def test_no_scenarios(wrong):
     """What is no scenario is refused with one line that names the argument."""
     with pytest.raises(InputError, match="^scenarios: "):
         simulate(wrong)
+    with pytest.raises(InputError, match="^scenarios: "):
+        Simulation(wrong)
+
+
+def test_not_together():
+    """A simulation refuses scenarios of several groups, whose robots it would all drive as the first one."""
+    one = Scenario()
+    for other, fields in ((one.replace(learner="rls"), "learner"), (one.replace(robot="turtlebot"), "robot, steering")):
+        with pytest.raises(InputError, match=f"^scenarios: 0 and 2 differ in {fields}, "):
+            Simulation([one, one, other])

@@ -482,7 +482,7 @@ def test_actions():
     ("make", "message"),
     [
         (lambda: TrackingEnv(SHORT, "torque"), "action: 'torque' is not twist, voltage, residual"),
-        (lambda: TrackingVectorEnv(2, [SHORT, SHORT.model_copy(update={"laps": 2})]), "scenarios: differ in"),
+        (lambda: TrackingVectorEnv(2, [SHORT, SHORT.model_copy(update={"laps": 2})]), "scenarios: 0 and 1 differ"),
         (lambda: TrackingVectorEnv(2, SHORT.model_copy(update={"motion_period": 0.05})), "motion_period: "),
         (lambda: TrackingVectorEnv(3, [SHORT]), "num_envs: 3, but 1 scenarios"),
         (lambda: TrackingVectorEnv(0, SHORT), "num_envs: 0 is below 1"),
