@@ -12,7 +12,7 @@ from mrctl.control.pid import pid
 from mrctl.control.steering import steer
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion, watch
-from mrctl.loop.user_stages import UserStage
+from mrctl.loop.user_stages import StageError, UserStage
 from mrctl.scenario import Scenario
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference
@@ -142,7 +142,7 @@ class UserHierarchy(Hierarchy):
         if (added := self.learner.learn(*taught)) is not None:
             state["added"] = self._sound(added)
             hand_over_all(state)
-        if feedback and (integral := getattr(feedback.stage, "integral", None)) is not None:
+        if feedback and (integral := self._integral(feedback)) is not None:
             integral[:] = state["pid"]["integral"]
         if asks:
             self.answer()
@@ -188,7 +188,7 @@ class UserHierarchy(Hierarchy):
         """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""
         state, reference = self.state, _numbers(goal)
         request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
-        own = getattr(stage.stage, "followed", None)
+        own = stage.member("followed")
         if own is not None:
             own = self._finite_rows(stage, stage.checked(own, reference.shape, "`followed`"))
             own = goal = np.ascontiguousarray(own).view(goal.dtype)[:, 0]
@@ -200,10 +200,18 @@ class UserHierarchy(Hierarchy):
         """Calls the user's feedback, and copies its integral for guard and hand-over."""
         state = self.state
         self.feedback[:] = self._finite_rows(stage, stage.output(self.command, twist, state["allocation"]["excess"]))
-        integral = getattr(stage.stage, "integral", None)
-        known = 0.0 if integral is None else stage.checked(integral, self.feedback.shape, "`integral`")
-        state["pid"]["integral"] = known
+        integral = self._integral(stage)
+        state["pid"]["integral"] = 0.0 if integral is None else integral
         state["guard"]["hands_over"] = integral is not None
+
+    def _integral(self, stage: UserStage) -> Array | None:
+        """Returns the user's own array of the integrals of a feedback, to which the hand-over writes, if it has one."""
+        if (own := stage.member("integral")) is None:
+            return None
+        found = stage.checked(own, self.feedback.shape, "`integral`")
+        if found is not own or not found.flags.writeable:
+            raise StageError(f"{stage.title}: `integral` is not a float64 array of NumPy that can be written")
+        return found
 
     def feedforward(self, command: Array, derivative: Array) -> Array:
         """Returns the feedforward of the prior and of the learner, the user's or a built-in one."""

@@ -67,6 +67,17 @@ class UserStage:
         """Returns whether the user's object has a method."""
         return callable(getattr(self.stage, method, None))
 
+    def member(self, name: str, default: Any = None) -> Any:  # noqa: ANN401
+        """Returns a member of the user's object, or the default where it has none.
+
+        Raises:
+            StageError: It is a property that raised.
+        """
+        try:
+            return _plain(getattr(self.stage, name, default))
+        except Exception as error:  # noqa: BLE001
+            raise self._raised(error) from error
+
     def call(self, method: str, *values: Any) -> Any:  # noqa: ANN401
         """Calls a method with copies of the arrays, in which zeros replace numbers that are not finite.
 
@@ -166,9 +177,9 @@ class UserFeedforward:
             StageError: The stage raised, says what it keeps in another form, or was made for another second channel.
         """
         self.stage, own = stage, stage.stage
-        if (made_for := getattr(own, "rigid", rigid)) != rigid:
+        if (made_for := stage.member("rigid", rigid)) != rigid:
             raise StageError(f"{stage.title}: it was made with rigid={made_for}, the steering asks for rigid={rigid}")
-        self.guarded, self.restorable = bool(getattr(own, "guarded", True)), bool(getattr(own, "restore", None))
+        self.guarded, self.restorable = bool(stage.member("guarded", True)), stage.has("restore")
         self.learner = own if isinstance(own, Learner) else None
         if self.learner:
             self.learner.prior = prior
@@ -179,7 +190,7 @@ class UserFeedforward:
     @property
     def weight_norm(self) -> Array | None:
         """Norm of its weights, `(B,)`, or None if it has none."""
-        norm = getattr(self.stage.stage, "weight_norm", None)
+        norm = self.stage.member("weight_norm")
         return None if norm is None else self.stage.checked(norm, (self.stage.size,), "`weight_norm`")
 
     @property

@@ -453,6 +453,41 @@ def test_refused(own, message):
         simulate(SHORT, **own)
 
 
+@pytest.mark.parametrize("integral", [torch.zeros((1, 2), dtype=torch.float64), np.zeros((1, 2), int), [[0.0, 0.0]]])
+def test_integral(integral):
+    """An integral to which the hand-over could not write, or whose numbers it would truncate, fails the run."""
+
+    class Own(Feedback):
+        def output(self, command, twist, excess):
+            self.integral = integral
+            return super().output(command, twist, excess)
+
+    failure = simulate(SHORT, feedback=Own).failure.item()
+    assert failure == "feedback Own: `integral` is not a float64 array of NumPy that can be written, tick 0"
+
+
+def test_raising_properties():
+    """A member that is a property and raises fails the run, with one line as any other error of a stage."""
+
+    class Own(Feedback):
+        integral = weight_norm = property(lambda self: 1 / 0, lambda self, value: None)
+
+        def __init__(self, robot, size):
+            self.state = np.zeros(size, PID)
+
+        def reset(self, *_):
+            pass
+
+        def output(self, command, *_):
+            return 0 * command
+
+        learn = reset
+
+    for stage in ("feedback", "feedforward"):
+        failure = simulate(SHORT, **{stage: Own}).failure.item()
+        assert failure.startswith(f"{stage} Own: ZeroDivisionError: division by zero (test_stages.py, line ")
+
+
 def test_settings_in_the_label():
     """Stages that differ in their settings alone are told apart, named as in the shell."""
 
