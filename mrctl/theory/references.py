@@ -454,7 +454,7 @@ def _time_law(
 
 
 def random_spline(
-    random: np.random.Generator, robot: Robot, speed: float = 0.95, reserve: float = LIMIT_SHARE
+    random: np.random.Generator, robot: Robot, speed: float = 0.95, share: float = LIMIT_SHARE
 ) -> Waypoints:
     """A random closed spline around the origin, driven at changing speed under the limits of a robot.
 
@@ -465,9 +465,9 @@ def random_spline(
         random: Source of the draws.
         robot: The robot.
         speed: Largest V as a share of the robot's limit, between 0 and 1.
-        reserve: Share of its other limits that the spline uses, between 0 and 1.
+        share: Share of its other limits that the spline uses, between 0 and 1.
     """
-    limits, top = Limits.of(robot, reserve), speed * robot.max_speed
+    limits, top = Limits.of(robot, share), speed * robot.max_speed
     while True:
         count = int(random.integers(4, 9))
         angles = 2 * np.pi * (np.arange(count) + random.uniform(-0.25, 0.25, count)) / count
@@ -479,7 +479,7 @@ def random_spline(
             continue
         curve = spline(loop.points, loop.closed)
         tightest = float(np.abs(curve.at(curve.s)[2]).max())
-        if np.arctan(abs(robot.wheelbase) * tightest) > reserve * robot.steering_limit:
+        if np.arctan(abs(robot.wheelbase) * tightest) > share * robot.steering_limit:
             continue
         grip = {"lateral_acceleration": min(limits.lateral_acceleration, slow**2 * tightest)}
         return loop.model_copy(update={"timing": "limits", "limits": limits.model_copy(update=grip)})

@@ -75,19 +75,19 @@ class Limits(Record):
         return self
 
     @classmethod
-    def of(cls, robot: Robot, reserve: float = LIMIT_SHARE) -> Limits:
+    def of(cls, robot: Robot, share: float = LIMIT_SHARE) -> Limits:
         """Returns the limits of a robot.
 
         Args:
             robot: The robot.
-            reserve: Share of each limit that is used, between 0 and 1.
+            share: Share of each limit that is used, between 0 and 1.
         """
         return cls(
-            acceleration=reserve * robot.max_acceleration,
-            rotation=reserve * robot.max_rotation,
-            rotation_acceleration=reserve * robot.max_rotation_acceleration,
-            lateral_acceleration=reserve * robot.tyre_friction * robot.gravity,
-            voltage=reserve * robot.supply,
+            acceleration=share * robot.max_acceleration,
+            rotation=share * robot.max_rotation,
+            rotation_acceleration=share * robot.max_rotation_acceleration,
+            lateral_acceleration=share * robot.tyre_friction * robot.gravity,
+            voltage=share * robot.supply,
             inverse=tuple((float(common), float(other)) for common, other in inverse_coefficients(robot)),
         )
 

@@ -45,11 +45,11 @@ def loads(motion, robot, limits, speed):
     return np.abs(np.column_stack([*shares, voltage / limits.voltage]))
 
 
-def splines(robot, reserve, count):
+def splines(robot, share, count):
     """Random splines that are driven up to the robot's speed limit."""
     random = np.random.default_rng(4)
     for _ in range(count):
-        yield random_spline(random, robot, 1.0, reserve)
+        yield random_spline(random, robot, 1.0, share)
 
 
 class Judged(LinearConstraint):
@@ -311,7 +311,7 @@ def test_speed_stays_real_where_the_limits_ask_for_acceleration():
 
 
 def test_default_limits():
-    """The defaults are those of the default robot, with the reserve."""
+    """The defaults are those of the default robot, times the share that is used."""
     expected = Limits.of(CAR)
     for name in Limits.model_fields:
         np.testing.assert_allclose(getattr(Limits(), name), getattr(expected, name), rtol=1e-4)
