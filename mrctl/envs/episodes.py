@@ -37,18 +37,18 @@ HALF_REWARD_DISTANCE = 0.05  # distance from the reference in m at which the rew
 
 @kernel
 def observe(
-    plant: Rows, seen: Rows, wanted: Rows, goal: Rows, control: Rows, radius: float, half_track: float,
+    plant: Rows, seen: Rows, wanted: Rows, now: Rows, control: Rows, radius: float, half_track: float,
     observation: Array, reward: Array,
 ) -> None:  # fmt: skip
-    """Computes what `Episodes.observe` returns, from records of `PLANT`, `SEEN`, `GOAL` and `CONTROL` of each robot.
+    """Computes what `Episodes.observe` returns, from the `PLANT`, `SEEN`, `REFERENCE` and `CONTROL` of each robot.
 
-    The observation uses the reference `wanted` at the time when the voltage acts, the reward the present one, `goal`.
+    The observation uses the reference `wanted` at the time when the voltage acts, the reward the present one, `now`.
     """
     error = np.empty(3)
     for i in range(len(plant)):
         p, s, g, out = plant[i], seen[i], wanted[i], observation[i]
         posture_error(s.pose, g.pose, out[:3])
-        posture_error(p.reading.pose, goal[i].pose, error)
+        posture_error(p.reading.pose, now[i].pose, error)
         for k in range(2):
             out[3 + k], out[5 + k], out[7 + k] = s.twist[k], g.twist[k], g.acceleration[k]
             out[9 + k], out[12 + k] = s.wheel_speeds[k] / radius, control[i].allocation.command[k]

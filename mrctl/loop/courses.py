@@ -15,7 +15,7 @@ from mrctl.scenario import Scenario
 SAMPLED_TICKS = 10_000  # control ticks whose references are sampled at once
 MAX_START_DISTANCE = 0.8  # m, largest distance between robot and reference at the start
 
-GOAL = np.dtype(
+REFERENCE = np.dtype(
     [
         ("pose", "f8", 3),  # reference x and y in m, θ in rad
         ("twist", "f8", 2),  # reference V in m/s and θ̇ in rad/s
@@ -25,7 +25,7 @@ GOAL = np.dtype(
 
 
 def course(scenario: Scenario, ticks: range) -> Rows:
-    """Returns the reference of a scenario, including the events that change it, one record of `GOAL` for each tick."""
+    """Returns the reference of a scenario, with the events that change it, one record of `REFERENCE` for each tick."""
     period = scenario.control_period
     samples = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
     for event in scenario.schedule:
@@ -33,7 +33,7 @@ def course(scenario: Scenario, ticks: range) -> Rows:
         if event.reference is not None and (since := max(start, ticks.start)) < ticks.stop:
             times = period * np.arange(since - start, ticks.stop - start, dtype=float)
             samples[since - ticks.start :] = np.hstack(event.reference.sample(times))
-    return np.ascontiguousarray(samples).view(GOAL)[:, 0]
+    return np.ascontiguousarray(samples).view(REFERENCE)[:, 0]
 
 
 def distinct_courses(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], NDArray[np.intp]]:
@@ -53,13 +53,13 @@ class Courses:
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)
-        self._tick, self._now = -1, (np.zeros(0, GOAL), np.zeros(0, GOAL))  # what `at` returned last
+        self._tick, self._now = -1, (np.zeros(0, REFERENCE), np.zeros(0, REFERENCE))  # what `at` returned last
 
     def at(self, tick: int) -> tuple[Rows, Rows]:
         """Returns the references at a control tick, and those at the time when the voltage of that tick acts.
 
         Returns:
-            Two arrays with a record of `GOAL` of each robot, `(B,)`.
+            Two arrays with a record of `REFERENCE` of each robot, `(B,)`.
         """
         if tick != self._tick:
             self._tick, self._now = tick, self._sampled(tick)

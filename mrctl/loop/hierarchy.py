@@ -70,20 +70,22 @@ respond, learn_one = nothing, learn_nothing  # the learner of `update`, which `K
 
 
 @kernel
-def request_motion(seen: Row, goal: Row, s: Row) -> None:
+def request_motion(seen: Row, reference: Row, s: Row) -> None:
     """The motion controller: from posture error to requested twist."""
-    posture_error(seen.pose, goal.pose, s.error)
-    kanayama(s.error, goal.twist, s.kanayama, s.request)
+    posture_error(seen.pose, reference.pose, s.error)
+    kanayama(s.error, reference.twist, s.kanayama, s.request)
     for k in range(2):
-        s.correction[k] = s.request[k] - goal.twist[k]
+        s.correction[k] = s.request[k] - reference.twist[k]
 
 
 @kernel
-def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
+def command_motion(reference: Row, robot: Row, period: float, s: Row) -> None:
     """Limiter and prefilter: from requested to commanded twist; the correction is held between two motion periods."""
     for k in range(2):
-        s.request[k] = goal.twist[k] + s.correction[k]
-    limit(s.request, goal.twist, goal.acceleration, robot.max_twist, robot.max_acceleration, period, s.limiter)
+        s.request[k] = reference.twist[k] + s.correction[k]
+    limit(
+        s.request, reference.twist, reference.acceleration, robot.max_twist, robot.max_acceleration, period, s.limiter
+    )
 
 
 @kernel
@@ -130,13 +132,13 @@ def hand_over(s: Row) -> None:
 
 
 @kernel
-def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tuple[bool, bool]:
+def update(moves: bool, seen: Rows, reference: Rows, period: float, place: int) -> tuple[bool, bool]:
     """One control tick of all robots, with the learner `respond` and `learn_one`.
 
     Args:
         moves: Whether the motion controller acts in this tick.
         seen: Record of `SEEN` of each robot.
-        goal: Record of `GOAL` of each robot.
+        reference: Record of `REFERENCE` of each robot.
         period: Control period in s.
         place: Address (see `Held`) of the nominal robot, one record of `NOMINAL`; its inverse dynamics, records of
             `PRIOR`, of which the first is read; a record of `PRIOR` and one of `CONTROL` of each robot; and a tuple of
@@ -148,7 +150,7 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
     robot, model, prior, control, arrays = held(place)
     finite, asks = True, False
     for i in range(len(control)):
-        s, measured, wanted = control[i], seen[i], goal[i]
+        s, measured, wanted = control[i], seen[i], reference[i]
         if moves:
             request_motion(measured, wanted, s)
         command_motion(wanted, robot[0], period, s)
@@ -440,17 +442,17 @@ class Hierarchy:
         """Returns the feedforward of prior and learner at a motion, `(B, 2)`."""
         return self.prior.output(command, derivative) + self.learner.output(command, derivative)
 
-    def update(self, seen: Rows, goal: Rows) -> Array:
+    def update(self, seen: Rows, reference: Rows) -> Array:
         """Computes the commands of one control tick.
 
         Args:
             seen: Estimate of each robot, a record of `SEEN`, `(B,)`.
-            goal: Reference of each robot at the time when the voltage acts, a record of `GOAL`, `(B,)`.
+            reference: Reference of each robot at the time when the voltage acts, a record of `REFERENCE`, `(B,)`.
 
         Returns:
             `output`, `(B, 4)`.
         """
-        finite, asks = self._update(self.moves, seen, goal, self.period, self._held.place)
+        finite, asks = self._update(self.moves, seen, reference, self.period, self._held.place)
         if asks:
             self.answer()
         self.faults = {} if finite else self.non_finite()  # the voltage limit would turn NaN into the full voltage

@@ -64,8 +64,8 @@ def drive(scenarios: Sequence[Scenario], coefficients: Array | None, threads: in
     if coefficients is not None:
         prior["c"] = coefficients
         # Starts anew, because these coefficients leave another voltage to the PID's integral.
-        goal, _ = simulation.courses.at(0)
-        hierarchy.reset(goal["twist"], goal["acceleration"], simulation.plant.reading["steering_angle"])
+        reference, _ = simulation.courses.at(0)
+        hierarchy.reset(reference["twist"], reference["acceleration"], simulation.plant.reading["steering_angle"])
     gram, seen = np.zeros((len(scenarios), 8, 8)), np.zeros((len(scenarios), 8, 2))
     while simulation.running:
         simulation.step()

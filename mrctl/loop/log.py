@@ -21,7 +21,7 @@ def beyond(feedforward: Array, limits: Array, rigid: bool) -> bool:
 
 
 @kernel
-def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, rigid: bool, error: Array, ticks: Rows) -> bool:
+def record(plant: Rows, seen: Rows, reference: Rows, control: Rows, rigid: bool, error: Array, ticks: Rows) -> bool:
     """Writes the signals of one control tick of all robots; returns whether all that go on are near their references.
 
     A sample at time t has the state at t, the commands computed from it, and the currents and the power at the end of
@@ -30,7 +30,7 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, rigid: bool, erro
     Args:
         plant: Record of `PLANT` of each robot, after the control period.
         seen: Record of `SEEN` of each robot.
-        goal: Record of `GOAL` of each robot.
+        reference: Record of `REFERENCE` of each robot.
         control: Record of `CONTROL` of each robot.
         rigid: Whether the second channel is steering.
         error: Scratch, `(3,)`.
@@ -38,7 +38,7 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, rigid: bool, erro
     """
     near = True
     for i in range(len(ticks)):
-        t, p, s, g, c = ticks[i], plant[i], seen[i], goal[i], control[i]
+        t, p, s, g, c = ticks[i], plant[i], seen[i], reference[i], control[i]
         state = p.before
         t.x, t.y, t.theta = state.pose[0], state.pose[1], state.pose[2]
         t.v, t.omega, t.v_lateral = state.twist[0], state.twist[1], state.v_lateral
@@ -99,7 +99,7 @@ class Log:
         self.now = self.at(tick)
         self.now.view(float).reshape(-1, len(SIGNALS))[rows] = np.nan
 
-    def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> None:
+    def record(self, tick: int, plant: Rows, seen: Rows, reference: Rows, control: Rows) -> None:
         """Records a tick; the arguments are those of the kernel `record`."""
         self.now = self.at(tick)
-        self.near = self._record(plant, seen, goal, control, self._rigid, self._error, self.now)
+        self.near = self._record(plant, seen, reference, control, self._rigid, self._error, self.now)

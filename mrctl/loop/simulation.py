@@ -377,10 +377,10 @@ class Simulation:
 
     def _start(self) -> None:
         """Sets the robots on their references with the twist of these; controllers and estimates start from there."""
-        goal, _ = self.courses.at(0)
-        poses = np.stack([start_pose(s, goal["pose"][row]) for row, s in enumerate(self.scenarios)])
-        self.plant.reset(poses, goal["twist"])
-        self.hierarchy.reset(goal["twist"], goal["acceleration"], self.plant.reading["steering_angle"])
+        reference, _ = self.courses.at(0)
+        poses = np.stack([start_pose(s, reference["pose"][row]) for row, s in enumerate(self.scenarios)])
+        self.plant.reset(poses, reference["twist"])
+        self.hierarchy.reset(reference["twist"], reference["acceleration"], self.plant.reading["steering_angle"])
         for row, scenario in enumerate(self.scenarios):
             self.estimator.start(row, self.plant.reading[row], scenario.seed, 0)
 
@@ -427,9 +427,9 @@ class Simulation:
     def step(self) -> None:
         """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
         try:
-            seen, goal = self.sense()
+            seen, reference = self.sense()
             now, _ = self.courses.at(self.tick)
-            self.plant.step(self.hierarchy.update(seen, goal), self.hierarchy.faults)
+            self.plant.step(self.hierarchy.update(seen, reference), self.hierarchy.faults)
             self.log.record(self.tick, self.plant.state, seen, now, self.hierarchy.state)
         except StageError as error:
             self._abort(f"{error}, tick {self.tick}")
@@ -439,7 +439,7 @@ class Simulation:
         """Applies the events of the coming tick and measures; further calls before `judge` only return the result.
 
         Returns:
-            Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are
+            Estimate of each robot, a record of `SEEN`, and its reference, one of `REFERENCE`, `(B,)` each; both are
             predicted to the time at which the voltage of this tick acts.
 
         Raises:
@@ -449,8 +449,8 @@ class Simulation:
             self.events.apply(self.tick)
             self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative)
             self._sensed = True
-        _, goal = self.courses.at(self.tick)
-        return self.estimator.seen, goal
+        _, reference = self.courses.at(self.tick)
+        return self.estimator.seen, reference
 
     def _abort(self, reason: str) -> None:
         """Fails all robots before the physics; the records until now are kept."""
@@ -497,9 +497,9 @@ class Simulation:
         self.scenarios[row], self._sensed = scenario, False
         self.hierarchy.renew(row, scenario)
         self.events.restart(row, scenario, tick)
-        goal, _ = self.courses.at(tick)
-        plant.restart(row, start_pose(scenario, goal["pose"][row]), goal["twist"][row])
-        self.hierarchy.reset(goal["twist"], goal["acceleration"], plant.reading["steering_angle"], row)
+        reference, _ = self.courses.at(tick)
+        plant.restart(row, start_pose(scenario, reference["pose"][row]), reference["twist"][row])
+        self.hierarchy.reset(reference["twist"], reference["acceleration"], plant.reading["steering_angle"], row)
         self.sensors.restart(row, scenario.seed, tick)
         self.estimator.start(row, plant.reading[row], scenario.seed, tick)
         self._failure_time[row] = np.nan

@@ -23,25 +23,25 @@ REPLACED = {"motion": ("k_x", "k_y", "k_theta"), "feedback": ("k_p", "k_i")}
 
 
 @kernel
-def request_all(seen: Rows, goal: Rows, control: Rows) -> None:
+def request_all(seen: Rows, reference: Rows, control: Rows) -> None:
     """Calls `request_motion` for all robots."""
     for i in range(len(control)):
-        request_motion(seen[i], goal[i], control[i])
+        request_motion(seen[i], reference[i], control[i])
 
 
 @kernel
-def errors_of_all(seen: Rows, goal: Rows, control: Rows) -> None:
+def errors_of_all(seen: Rows, reference: Rows, control: Rows) -> None:
     """Calls `posture_error` for all robots."""
     for i in range(len(control)):
-        posture_error(seen[i].pose, goal[i].pose, control[i].error)
+        posture_error(seen[i].pose, reference[i].pose, control[i].error)
 
 
 @kernel
-def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Rows) -> None:
+def command_all(seen: Rows, reference: Rows, robot: Rows, period: float, control: Rows) -> None:
     """Calls limiter, prefilter and PID for all robots."""
     for i in range(len(control)):
         s = control[i]
-        command_motion(goal[i], robot[0], period, s)
+        command_motion(reference[i], robot[0], period, s)
         pid(s.limiter.command, seen[i].twist, s.allocation.excess, period, s.pid, s.feedback)
 
 
@@ -107,7 +107,7 @@ class UserHierarchy(Hierarchy):
         if stage := self.stages.get("steering"):
             stage.call("reset", steering_angle, self.period)
 
-    def update(self, seen: Rows, goal: Rows) -> Array:
+    def update(self, seen: Rows, reference: Rows) -> Array:
         """Computes the commands of one control tick; see `Hierarchy.update`.
 
         Raises:
@@ -117,16 +117,16 @@ class UserHierarchy(Hierarchy):
         state, constants = self.state, (self.nominal, self.period)
         if stage := self.stages.get("motion"):
             if self.tick == self.started:
-                stage.call("reset", seen["pose"], _numbers(goal), self.motion_period)
-            for row, reference in self._new.items():
-                stage.ask("follow", row, reference)
+                stage.call("reset", seen["pose"], _numbers(reference), self.motion_period)
+            for row, plan in self._new.items():
+                stage.ask("follow", row, plan)
             self._new = {}
             self._show(stage, seen["estimate"])
             if self.moves:
-                self._wanted = self._request(stage, seen, goal)
+                self._wanted = self._request(stage, seen, reference)
         elif self.moves:
-            request_all(seen, goal, state)
-        command_all(seen, goal if self._wanted is None else self._wanted, *constants, state)
+            request_all(seen, reference, state)
+        command_all(seen, reference if self._wanted is None else self._wanted, *constants, state)
         feedback = self.stages.get("feedback")
         if feedback:
             self._feed_back(feedback, seen["twist"])
@@ -184,16 +184,16 @@ class UserHierarchy(Hierarchy):
             place, time = lidar.place(estimate[row, :3]), (self.tick - self.started) * self.period
             stage.ask("see", row, Scan(ranges.copy(), lidar.angles, lidar.range, place, time))
 
-    def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> Rows | None:
+    def _request(self, stage: UserStage, seen: Rows, reference: Rows) -> Rows | None:
         """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""
-        state, reference = self.state, _numbers(goal)
-        request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
+        state = self.state
+        request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], _numbers(reference)))
         own = stage.member("followed")
         if own is not None:
-            own = self._finite_rows(stage, stage.checked(own, reference.shape, "`followed`"))
-            own = goal = np.ascontiguousarray(own).view(goal.dtype)[:, 0]
-        errors_of_all(seen, goal, state)
-        state["correction"] = request - goal["twist"]
+            own = self._finite_rows(stage, stage.checked(own, (len(state), 7), "`followed`"))
+            own = reference = np.ascontiguousarray(own).view(reference.dtype)[:, 0]
+        errors_of_all(seen, reference, state)
+        state["correction"] = request - reference["twist"]
         return own
 
     def _feed_back(self, stage: UserStage, twist: Array) -> None:
@@ -255,6 +255,6 @@ class UserHierarchy(Hierarchy):
         return np.where(broken[:, None], 0.0, answer)
 
 
-def _numbers(goal: Rows) -> Array:
-    """Returns records of `GOAL` as the reference of `mrctl.control.stages.MotionStage`, `(B, 7)`."""
-    return goal.view(float).reshape(len(goal), -1)
+def _numbers(reference: Rows) -> Array:
+    """Returns records of `REFERENCE` as the reference of `mrctl.control.stages.MotionStage`, `(B, 7)`."""
+    return reference.view(float).reshape(len(reference), -1)

@@ -14,7 +14,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
-from mrctl.loop.courses import GOAL
+from mrctl.loop.courses import REFERENCE
 from mrctl.loop.hierarchy import HAND_OVER_SHARE, Hierarchy
 from mrctl.loop.user_hierarchy import UserHierarchy
 from mrctl.loop.user_stages import UserFeedforward, UserStage
@@ -47,10 +47,10 @@ def signals(size, ticks, seed=0):
 
 def tick(hierarchy, pose, twist, motion, slip=0.0):
     """One control tick with these measurements and references, `(B, …)`; its output."""
-    seen, goal = np.zeros(len(pose), SEEN), np.zeros(len(pose), GOAL)
+    seen, reference = np.zeros(len(pose), SEEN), np.zeros(len(pose), REFERENCE)
     seen["pose"], seen["twist"], seen["slip"] = pose, twist, slip
-    goal["pose"], goal["twist"], goal["acceleration"] = np.split(motion, [3, 5], axis=-1)
-    return hierarchy.update(seen, goal)
+    reference["pose"], reference["twist"], reference["acceleration"] = np.split(motion, [3, 5], axis=-1)
+    return hierarchy.update(seen, reference)
 
 
 def drive(hierarchy, inputs):
