@@ -22,7 +22,7 @@ from mrctl.control.mrac import Mrac
 from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
-from mrctl.record import Record, is_whole
+from mrctl.record import InputError, Record, is_whole
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Known, Obstacles
 from mrctl.theory.perturbation import Perturbation
@@ -246,8 +246,10 @@ def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]
         first: Seed of the first replicate.
 
     Raises:
-        InputError: A drawn perturbation is beyond its limits.
+        InputError: The first seed is negative, or a drawn perturbation is beyond its limits.
     """
+    if first < 0:
+        raise InputError(f"first: {first} is below 0, and no seed is")
     found = []
     for draw in range(first, first + count):
         events = tuple(

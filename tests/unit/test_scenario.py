@@ -355,3 +355,5 @@ def test_replicates():
     assert [r.seed for r in runs] == list(range(400)) and replicates(heavy, 3, first=7) == runs[7:10]
     factors = np.array([[getattr(r.perturbation, name) for name in REPLICATE_HALF_WIDTHS] for r in plain])
     assert np.abs(np.corrcoef(factors.T) - np.eye(len(REPLICATE_HALF_WIDTHS))).max() < 0.15
+    with pytest.raises(InputError, match="^first: -1 "):
+        replicates(heavy, 2, first=-1)
