@@ -75,12 +75,14 @@ class Tracking(control.Task):
         self._next = int(self._random.randint(2**32, dtype=np.uint32))
 
     def before_step(self, action: Array, physics: Physics) -> None:
-        """Applies the events, measures, and sends the commands of one control period; the action has shape `(2,)`."""
+        """Applies the events, measures, sends the commands and moves obstacles; the action has shape `(2,)`."""
         self.episodes.act(action)
         self.episodes.send()
+        self.episodes.plant.move_obstacles(1)
 
     def after_step(self, physics: Physics) -> None:
-        """Reads the state after the physics steps, records it, and finds failures."""
+        """Finds collisions, reads the state after the physics steps, records it, and finds other failures."""
+        self.episodes.plant.collide()
         self.episodes.plant.look()
         self.episodes.settle()
 

@@ -240,7 +240,7 @@ class Episodes:
         self._action[:] = action * scale
 
     def step(self) -> None:
-        """Computes one control period; if others advance the physics, `send` comes before it, the rest after it."""
+        """Computes one control period; where others step the physics, they do what `Plant.advance` does around that."""
         self.send()
         self.plant.advance()
         self.plant.look()

@@ -373,22 +373,26 @@ class Plant(ABC):
                 self.fail(int(robot), "non-finite command")
 
     def advance(self) -> None:
-        """Advances physics by one control period, with obstacles where they are at its end; fails on collisions."""
+        """Advances physics by one control period; others that do so call `move_obstacles` before, `collide` after."""
         if self.running:
-            self._move(1)
+            self.move_obstacles(1)
             for robot, reason in self._advance().items():
                 self.fail(robot, reason)
-            if self._collision >= 0:
-                for robot in np.flatnonzero(self.sensors[:, self._collision]):
-                    self.fail(int(robot), "collision")
+            self.collide()
 
-    def _move(self, ahead: int) -> None:
+    def move_obstacles(self, ahead: int) -> None:
         """Moves the moving obstacles to their poses `ahead` ticks from now."""
         position, turn = self.mocap
         for tracks, rows, bodies in self._moving:
             now = tracks.at(self._tick + ahead - self._began[rows[:, 0]])
             position[rows, bodies, :2] = now[..., :2]
             turn[rows, bodies, 0], turn[rows, bodies, 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
+
+    def collide(self) -> None:
+        """Fails robots whose hull has touched an obstacle in the last physics step."""
+        if self._collision >= 0:
+            for robot in np.flatnonzero(self.sensors[:, self._collision]):
+                self.fail(int(robot), "collision")
 
     def look(self) -> None:
         """Updates the readouts after the physics; fails robots that have tilted or whose state is not finite."""
@@ -422,7 +426,7 @@ class Plant(ABC):
         Until the first command of a delayed robot arrives, its motors get their nominal back-EMF, and the robot coasts.
         At 0 V they would brake it hard.
         """
-        self._move(0)
+        self.move_obstacles(0)
         state, queue = self.state[rows], self._queue[:, rows]
         for _ in range(2):
             self._look(rows.start, rows.stop, self._period, self._held.place)

@@ -155,6 +155,19 @@ def test_default():
     assert np.hypot(*first["goal"][:2]) > 3 and 0.2 < first["scan"].min() < first["scan"].max() <= 12
 
 
+def test_dm_env_collides():
+    """An obstacle that moves also comes and hits the robot where dm_control steps the physics."""
+    coming = Disc(x=-1.0, radius=0.2, course=Line(speed=0.8, heading=np.pi))
+    hit = TASK.replace(obstacles=Obstacles(shapes=(coming,)))
+    single, env, ticks = NavigationEnv(hit), Environment(Navigation(hit)), 0
+    length = len(drive(single, lambda _: np.zeros(2), seed=hit.seed)[1])
+    step = env.reset()
+    while not step.last():
+        step, ticks = env.step([0.0, 0.0]), ticks + 1
+    assert env.task.episodes.failure(0) == single.episodes.failure(0) == "collision"
+    assert (ticks, step.discount) == (length, 0.0)
+
+
 class TestDmEnv(test_utils.EnvironmentTestMixin, absltest.TestCase):
     """dm_env's own tests."""
 
