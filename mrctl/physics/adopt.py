@@ -76,7 +76,11 @@ class _Adoption:
         self.model = self.spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, self.data)
-        wheels, steered = self._driven(robot.wheels), self._steered(robot.steering)
+        wheels = self._driven(robot.wheels)
+        found = [self._wheel(name) for name in wheels]
+        self.radius = float(np.mean([wheel.radius for wheel in found]))
+        self.floor = float(np.mean([wheel.centre[2] - wheel.radius for wheel in found]))
+        steered = self._steered(robot.steering)
         self.chassis = self._carrier(robot.chassis, wheels)
         self.ahead, self.left = self._directions(wheels, steered)
         places = {name: self._on_axle(name) for name in wheels}
@@ -84,7 +88,6 @@ class _Adoption:
         self.wheels = sorted(wheels, key=lambda name: -float((places[name] - self.origin) @ self.left))
         self.steered = sorted(steered, key=self._side)
         self.rear = [self._wheel(name) for name in self.wheels]
-        self.radius = float(np.mean([wheel.radius for wheel in self.rear]))
         self.motors = [self._motor(name) for name in self.wheels]
         self.front = [self._steered_wheel(name) for name in self.steered] or self._casters()
 
@@ -106,12 +109,16 @@ class _Adoption:
     def _steered(self, names: Sequence[str]) -> list[str]:
         """Returns the joints of the steered wheels, at most two: those named, or the upright ones that are moved.
 
-        A joint is moved by an actuator of its own, or by an equality that couples it to a joint with an actuator.
+        A joint is moved by an actuator of its own, or by an equality that couples it to a joint with an actuator. Where
+        nothing that it carries reaches the floor, as with a camera that pans, it steers nothing.
         """
         moved = {a.target for a in self.spec.actuators if self._is_hinge(a)}
         couplings = [{e.name1, e.name2} for e in self.spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT]
         moved = moved.union(*(coupling for coupling in couplings if coupling & moved))
-        upright = [name for name in self._hinges() if abs(self._axis(name)[2]) > 0.9 and name in moved]
+        upright = [
+            name for name in self._hinges()
+            if abs(self._axis(name)[2]) > 0.9 and name in moved and self._low(self._lineage(name)[0])
+        ]  # fmt: skip
         joints = list(names) or upright
         if len(joints) > 2 or len(set(joints)) < len(joints):
             raise InputError(f"steering: {_listed(joints)}; name one or two upright joints with an actuator")
@@ -186,22 +193,17 @@ class _Adoption:
 
         Geoms that collide are preferred to those that do not, and geoms at the same place count as one.
         """
-        floor = np.mean([wheel.centre[2] - wheel.radius for wheel in self.rear])
         wheels = {wheel.body for wheel in self.rear}
-        low = [
-            g for g in range(self.model.ngeom)
-            if self.chassis in (line := self._ancestry(self.model.geom_bodyid[g])) and not wheels & set(line)
-            and self._bottom(g) - floor < FLOOR_TOLERANCE * self.radius
-        ]  # fmt: skip
+        low = [g for g in self._low(self.chassis) if not wheels & set(self._ancestry(self.model.geom_bodyid[g]))]
         casters: list[Wheel] = []
         names: list[str] = []
         for g in self._colliding(low) or low:
             body = self.model.body(self.model.geom_bodyid[g])
             centre = self.data.geom_xpos[g]
             if all(np.hypot(*(centre - other.centre)[:2]) > FLOOR_TOLERANCE * self.radius for other in casters):
-                caster, radius = self._contact(g, body.name, self._roller(body.name)), centre[2] - floor
+                caster, radius = self._contact(g, body.name, self._roller(body.name)), centre[2] - self.floor
                 if radius <= 0:
-                    depth = floor - self._bottom(g)
+                    depth = self.floor - self._bottom(g)
                     raise InputError(
                         f"caster: {part(self.model, g)} ends {1e3 * depth:.4g} mm below the floor of the wheels, and "
                         "its centre is not above it; correct its height, or that of the wheels"
@@ -214,7 +216,7 @@ class _Adoption:
             unit = f"; their radius is {self.radius:.4g} m: is it in mm or cm?" if self.radius > track else ""
             raise InputError(
                 "caster: beside the driven wheels nothing reaches the floor, and nothing is steered"
-                + (unit or self._gaps(float(floor)))
+                + (unit or self._gaps())
             )
         distances = [(caster.centre - self.origin) @ self.ahead for caster in casters]
         if len(casters) > 2 or min(distances) * max(distances) < 0:
@@ -232,7 +234,7 @@ class _Adoption:
                     f'if it is steered, add <position joint="{name}" kp="K" kv="D"/>'
                 )
 
-    def _gaps(self, floor: float) -> str:
+    def _gaps(self) -> str:
         """Returns a clause on how far above the floor of the driven wheels the lowest other part ends."""
         wheels = {wheel.body for wheel in self.rear}
         others = [
@@ -240,7 +242,7 @@ class _Adoption:
             if self.chassis in (line := self._ancestry(self.model.geom_bodyid[g])) and not wheels & set(line)
         ]  # fmt: skip
         lowest = min(others, key=self._bottom, default=None)
-        if lowest is None or not np.isfinite(gap := self._bottom(lowest) - floor):
+        if lowest is None or not np.isfinite(gap := self._bottom(lowest) - self.floor):
             return ""
         text = f"; {part(self.model, lowest)} ends {1e3 * gap:.4g} mm above the floor of the wheels"
         left, right = (wheel.centre[2] - wheel.radius for wheel in self.rear)
@@ -248,6 +250,14 @@ class _Adoption:
             lower = self.wheels[int(right < left)]
             text += f", of which that of joint {lower!r} is {1e3 * abs(left - right):.4g} mm lower than the other"
         return text
+
+    def _low(self, body: str) -> list[int]:
+        """Returns the geoms that a body carries and that reach the floor of the driven wheels."""
+        return [
+            g for g in range(self.model.ngeom)
+            if body in self._ancestry(self.model.geom_bodyid[g])
+            and self._bottom(g) - self.floor < FLOOR_TOLERANCE * self.radius
+        ]  # fmt: skip
 
     def _roller(self, body: str) -> str:
         """Returns the joint on which a caster's body rolls, a ball or a level hinge; empty where it slides."""

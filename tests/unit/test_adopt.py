@@ -12,7 +12,7 @@ from mrctl.loop.simulation import Simulation
 from mrctl.navigation.mission import navigate
 from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
-from mrctl.physics.elements import fronts
+from mrctl.physics.elements import fronts, has
 from mrctl.physics.files import models_folder
 from mrctl.physics.hull import footprint
 from mrctl.physics.parameters import read_robot
@@ -236,6 +236,18 @@ def test_geared_servo(file):
     data.ctrl[model.actuator_ctrladr[model.actuator("steering").id]] = 10.0
     mujoco.mj_forward(model, data)
     assert data.qfrc_actuator[model.joint("steering").dofadr[0]] == pytest.approx(strongest)
+
+
+PAN = """<body pos="0.1 0 0.1"><joint name="pan" axis="0 0 1"/><geom size="0.02" mass="0.1"/>
+  <body><joint name="tilt" axis="0 1 0"/><geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body></body>"""
+
+
+@pytest.mark.parametrize(("body", "servos", "steered"), [(DIFF, "", ()), (TRICYCLE, SERVO.format("s1"), ("s1",))])
+def test_camera_that_pans(file, body, servos, steered):
+    """An upright joint with a servo that carries a camera steers nothing."""
+    text = document(body + PAN, MOTORS + servos + SERVO.format("pan"))
+    found, model = read(file(text))
+    assert found == read(file(text), steering=steered)[0] and has(model, "joint", "robot/pan")
 
 
 def test_linkage_with_one_servo(file):
