@@ -350,6 +350,10 @@ class _Adoption:
         for kind, old, new in names:
             element = getattr(spec, kind)(PREFIX + old)
             element.name = new
+            if kind == "body":
+                for looking in (*spec.cameras, *spec.lights):
+                    if looking.targetbody == PREFIX + old:
+                        looking.targetbody = new
         for motor, wheel in zip(MOTORS, REAR, strict=True):
             spec.actuator(motor).target = wheel
         spec.body("chassis").add_freejoint(name="chassis")
@@ -375,6 +379,12 @@ class _Adoption:
         Couplings of steered or driven wheels go too, as the linkage and the floor replace them.
         """
         spec = self.spec
+        renamed = {old for kind, old, _ in self._renamed() if kind == "body"}
+        for e in spec.equalities:  # whose anchors are in the frames of bodies, which change
+            if e.objtype == mujoco.mjtObj.mjOBJ_BODY and (joined := renamed & {e.name1, e.name2}):
+                raise InputError(
+                    f"equality: joins the body {min(joined)!r}, which mrctl moves; give it site1 and site2 instead"
+                )
         steering = [a for a in spec.actuators if a.target in self.steered]
         coupled = [e for e in spec.equalities if {e.name1, e.name2} & {*self.steered, *self.wheels}]
         for element in [*spec.sensors, *spec.keys, *spec.pairs, *spec.excludes, *steering, *coupled]:

@@ -235,7 +235,8 @@ def load_robot(
     Args:
         path: `turtlebot`, `racecar`, or the path of an MJCF file.
         wheels: Joints of the two driven wheels; by default the two with a `<dcmotor>`.
-        steering: Joint or joints of the steered wheels; by default the upright joints with an actuator.
+        steering: Joint or joints of the steered wheels; by default the upright joints with an actuator that carry
+            something which reaches the floor.
         chassis: Body that carries the wheels; by default the root of the wheels.
 
     Raises:

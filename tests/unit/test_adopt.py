@@ -250,6 +250,13 @@ def test_camera_that_pans(file, body, servos, steered):
     assert found == read(file(text), steering=steered)[0] and has(model, "joint", "robot/pan")
 
 
+def test_camera_that_looks_at_a_body(file):
+    """A camera of the robot may look at a body that gets another name."""
+    camera = '<camera pos="-1 0 1" mode="targetbody" target="base"/>'
+    _, model = read(file(document(DIFF + camera, MOTORS)))
+    assert model.cam_targetbodyid.tolist() == [model.body("chassis").id]
+
+
 def test_linkage_with_one_servo(file):
     """Of two steered wheels that an equality couples, one servo steers both."""
     couple = '<equality><joint joint1="s2" joint2="s1"/></equality>'
@@ -483,6 +490,10 @@ ERRORS = {
     "nothing to roll on": (
         document(TRICYCLE.replace('name="c" axis="0 1 0"', 'name="c" axis="0 0 1"'), MOTORS + SERVO.format("s1")), {},
         ("steering", "'s1'", "roll")),
+    "a loop closed at a wheel": (
+        document(TRICYCLE.replace('<body pos="0.5', '<body name="f" pos="0.5'), MOTORS + SERVO.format("s1")).replace(
+            "</mujoco>", '<equality><connect body1="f" body2="base" anchor="0 0 0"/></equality></mujoco>'), {},
+        ("equality", "'base'", "site1")),
     "tips over": (document(DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"'), MOTORS), {}, ("com_offset",)),
     "not MJCF": ("<urdf/>", {}, ("mine.xml",)),
     "limits": (
