@@ -19,7 +19,7 @@ FREE_MARGIN = 0.2  # m before what a beam met, up to which there is nothing for 
 class Lidar(Record):
     """A planar lidar; the defaults are about the values of an RPLIDAR A1."""
 
-    rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    rate: Annotated[float, Field(ge=1e-3, le=1000)] = 10.0
     """Rate of the scans in Hz; all beams of a scan are taken at the same time."""
     beams: Annotated[int, Field(ge=1, le=10_000)] = 360
     """Number of beams of a scan."""

@@ -81,6 +81,8 @@ LOCALISED: dict[str, dict[str, float]] = {
 }
 """Values that replace the tier's where fixes come from a lidar: about twice the errors that the tests find."""
 
+MIN_RATE = 1e-3
+"""Lowest rate of a sensor in Hz that is not 0; memory is needed for two periods of the encoders."""
 Rate = Annotated[float, Field(ge=0, le=10_000)]
 Latency = Annotated[float, Field(ge=0, le=MAX_DELAY)]
 
@@ -203,9 +205,12 @@ class Sensing(Record):
             control_period: Control period in s.
 
         Raises:
-            ValueError: A value that replaces the tier's is no whole number of control periods; the message names it.
+            ValueError: A value that replaces the tier's is no whole number of control periods, or a rate is below
+                `MIN_RATE`; the message names it.
         """
         value, rate = self[name], name.endswith("_rate")
+        if rate and 0 < value < MIN_RATE:
+            raise ValueError(f"sensing.{name}: {value:g} Hz is neither 0 nor at least {MIN_RATE:g} Hz")
         time = (1 / value if value else control_period) if rate else value
         count = round(time / control_period)
         if getattr(self, name) is None:

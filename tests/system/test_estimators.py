@@ -604,6 +604,8 @@ REFUSED = {
         "sensing": {"fix_latency": 0.4, "fix_rate": 5},
         "reference": {"kind": "line", "length": 0.1},
     },
+    "sensing.gyro_rate: 1e-300 Hz is neither": {"sensing": {"gyro_rate": 1e-300}},
+    "sensing.lidar.rate": {"sensing": {"lidar": {"rate": 1e-300}}},
     "sensing.fix_latency: more than 4": {"sensing": {"tier": "lab", "fix_latency": 0.5}},
     "sensing.gyro_latency": {"sensing": {"gyro_latency": 0.013}},
     "sensing.delay": {"sensing": {"delay": 0.015}},
