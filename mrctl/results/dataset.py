@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -254,11 +255,25 @@ def scenarios_of(result: xr.Dataset) -> list[Scenario]:
     """Returns the resolved scenarios of the runs in a result, or in a selection of them, to run again.
 
     Raises:
-        InputError: Another version of mrctl, which the message names, wrote a scenario that this one does not know.
+        InputError: Another version of mrctl, which the message names, wrote a scenario that this one does not know; or
+            as `held_scenarios`.
+    """
+    source = f"scenario of a result of mrctl {written_by(result)}"
+    return [Scenario.from_dict(one, source) for one in held_scenarios(result)]
+
+
+def held_scenarios(result: xr.Dataset) -> list[dict[str, Any]]:
+    """Returns the fields of the scenarios of the runs in a result, or in a selection of them.
+
+    Raises:
+        InputError: A selection of one run has lost its number, so that nothing tells which scenario is its own.
     """
     every = json.loads(result.attrs["scenarios"])
-    source = f"scenario of a result of mrctl {written_by(result)}"
-    return [Scenario.from_dict(every[run], source) for run in np.atleast_1d(result["run"])]
+    if "run" in result.dims or "run" in result.coords:
+        return [every[run] for run in np.atleast_1d(result["run"])]
+    if len(every) != 1:
+        raise InputError("run: the selection has lost the number of its run; select it without drop=True")
+    return every
 
 
 def save(result: xr.Dataset, path: str | Path) -> None:

@@ -8,7 +8,6 @@ in s; `lap` is the number of a lap, counted from 1, or from −1 backwards from 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
@@ -29,7 +28,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
-from mrctl.results.dataset import check_kind, scenarios_of
+from mrctl.results.dataset import check_kind, held_scenarios, scenarios_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap, shown_unit
 from mrctl.theory.obstacles import Obstacles, turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -149,7 +148,7 @@ def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int
     curves = _curves(result, window, lap)
     if "scenarios" in result.attrs:
         times = max((data["time"].values[np.isfinite(data["x"].values)] for data, *_ in curves), key=len)
-        scenarios = scenarios_of(as_runs(result))
+        scenarios = scenarios_of(result)
         for scenario, curve in zip(scenarios, curves, strict=True):
             if scenario.obstacles != scenarios[0].obstacles:
                 other, first = (int(one.data["run"]) for one in (curve, curves[0]))
@@ -612,8 +611,7 @@ def _plant(*results: xr.Dataset) -> str:
     names = [(name, perturbation.model_dump(mode="json")) for name, perturbation in PERTURBATIONS.items()]
     found: dict[str, set[str]] = {"robots": set(), "perturbations": set(), "sensing tiers": set()}
     for result in results:
-        every = json.loads(result.attrs["scenarios"])
-        for one in (every[run] for run in np.atleast_1d(result["run"])):
+        for one in held_scenarios(result):
             change = Perturbation().model_dump(mode="json") | one["perturbation"]
             name = next((name for name, fields in names if fields == change), "perturbed")
             parts = Path(one["robot"]["path"]).stem, name + " with events" * bool(one["events"]), one["sensing"]["tier"]

@@ -126,6 +126,11 @@ def test_plant_is_named():
     both = "plant: different robots, different perturbations, lab"
     assert plots.path(result).legends[0].get_title().get_text() == both
     assert plots.compare_errors(result.isel(run=0), result.isel(run=1)).legends[0].get_title().get_text() == both
+    with pytest.raises(InputError, match=r"^run: the selection has lost the number of its run; .*$"):
+        plots.errors(result.isel(run=1, drop=True))
+    result.attrs["scenarios"] = json.dumps(kinds[1:])
+    alone = plots.errors(result.isel(run=0, drop=True))
+    assert alone.legends[0].get_title().get_text() == "plant: b, perturbed, lab"
 
 
 def test_path():
