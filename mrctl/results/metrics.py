@@ -399,7 +399,7 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     """Makes a table with a row for each run: its description, whether it failed, and its metrics in one lap.
 
     Args:
-        result: What `simulate` or `per_lap` returns.
+        result: What `simulate` or `per_lap` returns, or one run of it.
         lap: Number of the lap, counted from 1, or from −1 backwards from the end of the run. A run without such a lap
             has NaN.
 
@@ -413,7 +413,7 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
         InputError: No run has that lap.
     """
     check_kind(result)
-    laps = result if "lap" in result.dims else per_lap(result)
+    laps = as_runs(result) if "lap" in result.dims else per_lap(result)
     counts = laps["laps"].values
     index = np.where(lap > 0, lap - 1, counts + lap)
     there = (index >= 0) & (index < counts)

@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from hypothesis import assume, given, settings
@@ -211,7 +212,9 @@ def test_single_run():
     """A squeezed run gives the same numbers as the run in its batch, and keeps its label."""
     result = make(runs=2, v=np.array([[1.0], [2.0]]))
     single = metrics.per_lap(result.isel(run=1))
-    xr.testing.assert_identical(single, metrics.per_lap(result.isel(run=[1])))
+    both = metrics.per_lap(result)
+    xr.testing.assert_identical(single, both.isel(run=[1]))
+    pd.testing.assert_frame_equal(metrics.summary(both.isel(run=1)), metrics.summary(both.isel(run=[1])))
 
 
 @pytest.mark.parametrize(("time", "good"), [(0.0, 0), (2.5, 1), (4.0, 2), (5.99, 2), (6.5, 2)])
