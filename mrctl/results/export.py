@@ -153,7 +153,8 @@ def _that_drove(whole: xr.Dataset) -> xr.Dataset:
             drove[k] = np.isfinite(whole["x"].isel(run=k).values).any()
     idle = whole["run"].values[~drove].tolist()
     if not drove.any():
-        why = f"; run {idle[0]}: {whole['failure'].values[0]}" if idle and "failure" in whole else ""
+        reason = str(whole["failure"].values[0]) if idle and "failure" in whole else ""
+        why = f"; run {idle[0]}: {reason}" if reason else ""
         raise InputError(f"result: holds no run that drove{why}" if idle else "result: holds no run")
     if idle:
         more = f" and {len(idle) - 10} more" if len(idle) > 10 else ""

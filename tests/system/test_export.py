@@ -301,6 +301,8 @@ def test_sweep(tmp_path):
     assert np.array_equal([m.angular_velocity.z for m in found["/run2/imu"][2]], signals.gyro[2])
     with pytest.raises(InputError, match="does not hold its scenarios"):
         export(signals, "mcap", tmp_path / "none.mcap")
+    with pytest.raises(InputError, match=r"^result: holds no run that drove$"):  # in no time
+        export(signals.isel(time=[]), "csv", tmp_path / "none.csv")
     with pytest.raises(InputError, match="holds metrics only"):
         export(mrctl.open(tmp_path / "metrics"), "csv", tmp_path / "none.csv")
 
