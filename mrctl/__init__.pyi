@@ -10,8 +10,8 @@ from .control.pid import Pid as Pid
 from .control.rls import Rls as Rls
 from .control.weights import save_weights as save_weights
 from .loop.learned import save_learned as save_learned
+from .loop.runs import simulate as simulate
 from .loop.simulation import Simulation as Simulation
-from .loop.simulation import simulate as simulate
 from .physics.mjcf import load_robot as load_robot
 from .record import InputError as InputError
 from .results import plots as plots

@@ -39,7 +39,7 @@ def warn_if_impossible(scenario: Scenario) -> None:
     if file in SHIPPED or not file.endswith(".xml"):
         return
     from mrctl.checks.examination import impossible
-    from mrctl.loop.simulation import arranged
+    from mrctl.loop.groups import arranged
     from mrctl.physics.mjcf import load
 
     scenario = arranged(scenario)
@@ -65,7 +65,7 @@ def suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | No
     given = fields_set(arguments)
     if scenario_file or "robot" not in given or "reference" in given:
         return scenario
-    from mrctl.loop.simulation import suited
+    from mrctl.loop.groups import suited
 
     return suited(scenario)
 

@@ -55,7 +55,7 @@ def observe(
         out[11] = control[i].allocation.angle
         x, y, theta = error[0], error[1], half_track * error[2]
         reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / HALF_REWARD_DISTANCE**2)
-        if p.failed:
+        if p.stopped:
             reward[i] = 0.0
             for k in range(len(out)):  # the state may have diverged
                 if not np.isfinite(out[k]):
@@ -296,7 +296,7 @@ class Episodes:
 
     def ended(self) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
         """Tells which episodes ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
-        terminated = self.plant.failed.copy()
+        terminated = self.plant.stopped.copy()
         return terminated, (self.tick - self.start >= self._lengths) & ~terminated
 
     def failure(self, row: int) -> str:

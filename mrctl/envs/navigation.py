@@ -81,7 +81,7 @@ class Navigating(Episodes):
 
     def send(self) -> None:
         """Sends as `Episodes.send`, and notes which robots still drive."""
-        self._drives = ~self.plant.failed
+        self._drives = ~self.plant.stopped
         super().send()
 
     def settle(self) -> None:
@@ -113,7 +113,7 @@ class Navigating(Episodes):
         for row, own in enumerate(found):
             posture_error.compiled(seen["pose"][row], self.goals[row], own[:3])
         found[:, 3:5], found[:, 5:] = seen["twist"], self._scans
-        found[self.plant.failed] = np.nan_to_num(found[self.plant.failed], posinf=0, neginf=0)  # may have diverged
+        found[self.plant.stopped] = np.nan_to_num(found[self.plant.stopped], posinf=0, neginf=0)  # may have diverged
         return found, self._reward.copy()
 
 

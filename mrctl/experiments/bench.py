@@ -28,8 +28,9 @@ from mrctl.experiments import bench_navigation, paper
 from mrctl.experiments.tables import machine, markdown, number
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import Log
-from mrctl.loop.simulation import Simulation, split
-from mrctl.loop.simulation import run as run_all
+from mrctl.loop.runs import run as run_all
+from mrctl.loop.runs import split
+from mrctl.loop.simulation import Simulation
 from mrctl.physics.car import CarPhysics
 from mrctl.physics.mjcf import load
 from mrctl.physics.parameters import read_robot

@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 from mrctl.experiments.tables import markdown, number
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation import planning
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.hybrid_astar import cost_to_go, plan, space

@@ -262,7 +262,7 @@ def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Gener
         common, differential = period[k % len(period)].T
         command[:, 0], command[:, 1] = common - differential, common + differential
         plant.step(command)
-    if plant.failed.any():
+    if plant.stopped.any():
         raise InputError(f"identify: a robot failed during the drive: {next(filter(None, plant.failure))}")
 
     time = HOLD_TIME * np.arange(ticks + 1)[-PERIODS * len(period) :]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from mrctl.loop.simulation import cores
+from mrctl.loop.groups import cores
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
 from mrctl.sweep.jobs import code_digest

@@ -24,8 +24,9 @@ from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import PLANTS as SHARED
 from mrctl.experiments.mission_suite import ROOMY_FACTOR, SHAPE, TIE, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
+from mrctl.loop.groups import arranged
 from mrctl.loop.learned import kept, save_learned
-from mrctl.loop.simulation import arranged, simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import reached
 from mrctl.navigation.plan import Plan

@@ -27,7 +27,7 @@ from mrctl.experiments.suite_tables import titled
 from mrctl.experiments.tables import Table, frame, number, share_cell, wins_cell
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation.generators import corridor, corridor_width
 from mrctl.navigation.planning import PATIENCE, Query, planned
 from mrctl.navigation.vehicle import Vehicle

@@ -11,7 +11,7 @@ from mrctl.experiments import learned_limits, mission_suite, three_mppis
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import Mode
 from mrctl.experiments.tables import Table, machine, output_folder, write_json
-from mrctl.loop.simulation import arranged
+from mrctl.loop.groups import arranged
 from mrctl.physics import mjcf
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario

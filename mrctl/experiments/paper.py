@@ -22,7 +22,7 @@ from mrctl.control.pid import Pid
 from mrctl.experiments import kanayama
 from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
 from mrctl.loop.hindsight import best_fixed
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results import drawings, metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario, replicates

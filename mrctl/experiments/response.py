@@ -20,8 +20,9 @@ from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.control.guard import Guard
 from mrctl.control.matching import HOLD_PERIODS
 from mrctl.kernel import Array
+from mrctl.loop.groups import arranged
 from mrctl.loop.hierarchy import HAND_OVER_SHARE
-from mrctl.loop.simulation import Simulation, arranged
+from mrctl.loop.simulation import Simulation
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.theory.references import Line
@@ -120,7 +121,7 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
     simulation = Simulation(runs, feedforward=lambda robot, size: shaker)
     while simulation.running:
         simulation.step()
-    for row in np.flatnonzero(simulation.plant.failed):
+    for row in np.flatnonzero(simulation.plant.stopped):
         raise InputError(f"world: no response on {line.length:g} m of it: {simulation.plant.failure[row]}")
     response = -estimate(signal[:, channel], shaker.feedback[PERIOD_TICKS:, :, channel], harmonics)
     return 2 * np.pi / (PERIOD_TICKS * first.control_period) * harmonics.astype(float), response

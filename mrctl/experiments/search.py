@@ -44,7 +44,8 @@ from mrctl.experiments.journal import Journal
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
 from mrctl.kernel import Array
 from mrctl.loop import user_files
-from mrctl.loop.simulation import Simulation, run
+from mrctl.loop.runs import run
+from mrctl.loop.simulation import Simulation
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError

@@ -15,7 +15,8 @@ from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.learned import save_learned
-from mrctl.loop.simulation import named_stages, simulate
+from mrctl.loop.runs import simulate
+from mrctl.loop.user_stages import named_stages
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.dataset import departure, faults_of, save, scenarios_of, versions

@@ -36,8 +36,9 @@ from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables,
 from mrctl.experiments.tables import machine, output_folder, write_json
 from mrctl.kernel import Array
 from mrctl.loop import user_files
+from mrctl.loop.groups import cores
 from mrctl.loop.hindsight import REPETITIONS
-from mrctl.loop.simulation import cores, simulate
+from mrctl.loop.runs import simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson

@@ -22,7 +22,7 @@ from scipy.optimize import fminbound
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import PLANTS, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import outcomes

@@ -22,7 +22,8 @@ import xarray as xr
 
 from mrctl.control.features import feature_matrix
 from mrctl.kernel import Array
-from mrctl.loop.simulation import Simulation, uniform
+from mrctl.loop.groups import uniform
+from mrctl.loop.simulation import Simulation
 from mrctl.results import dataset
 from mrctl.results.metrics import over_laps, per_lap
 from mrctl.scenario import Scenario

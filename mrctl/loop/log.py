@@ -69,7 +69,7 @@ def record(plant: Rows, seen: Rows, reference: Rows, control: Rows, rigid: bool,
         t.z, t.roll_angle, t.pitch_angle = state.z, state.roll, state.pitch
         t.feedforward_limited = 1.0 if c.guard.on and beyond(c.feedforward, c.guard.range, rigid) else 0.0
         t.motor_voltage_left, t.motor_voltage_right = p.applied[0], p.applied[1]
-        near &= not abs(t.lateral_error) > MAX_LATERAL_ERROR or p.failed
+        near &= not abs(t.lateral_error) > MAX_LATERAL_ERROR or p.stopped
     return near
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.control.feedforward import Learner, Prior
-from mrctl.control.stages import METHODS, Factory
+from mrctl.control.stages import METHODS, Factory, Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.learned import load_arrays, load_learned
 from mrctl.record import InputError
@@ -137,6 +137,11 @@ class UserStage:
         frames = traceback.extract_tb(error.__traceback__)[1:2]  # the line of the stage's own method
         place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in frames)
         return StageError(" ".join(f"{self.title}: {type(error).__name__}: {error}{place}".split()))
+
+
+def named_stages(stages: Stages) -> dict[str, str]:
+    """Returns the names of the user's factories by stage."""
+    return {stage: name_of(factory) for stage, factory in stages.items() if factory}
 
 
 def name_of(factory: object) -> str:

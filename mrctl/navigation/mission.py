@@ -14,7 +14,7 @@ import xarray as xr
 
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.plan import Plan

@@ -57,7 +57,7 @@ PLANT = np.dtype(
         ("imu_axes", "f8", (2, 3)),  # its axes forward and to the left, in the world
         ("specific_force", "f8", 2),  # forward and to the left at the inertial sensor, mean over the period, m/s²
         ("gravity", "f8", 3),  # in the world, m/s²
-        ("failed", "?"),  # whether the robot has stopped
+        ("stopped", "?"),  # whether the robot has stopped
     ],
     align=True,
 )
@@ -81,7 +81,7 @@ def send(command: Array, tick: int, place: int) -> bool:
             queue[tick % len(queue), i, k] = command[i, k]
         now = queue[(tick - p.delay) % len(queue), i]
         for k in range(len(inputs)):
-            finite &= np.isfinite(now[k]) or p.failed
+            finite &= np.isfinite(now[k]) or p.stopped
         back_emf(p)
         drive(now[:2], p.emf, p.resistance, p.driver, p.sent)
         for k in range(2):
@@ -133,7 +133,7 @@ def look(first: int, last: int, period: float, place: int) -> bool:
                 p.current[k] = max(-limit, min(limit, act[i, acts[k]]))
             else:
                 p.current[k] = (p.applied[k] - p.emf[k]) / p.resistance[k]
-        upright &= p.reading.upright > MIN_COS_TILT or p.failed
+        upright &= p.reading.upright > MIN_COS_TILT or p.stopped
     return upright
 
 
@@ -153,19 +153,19 @@ class Tracks:
 
 
 class Plant(ABC):
-    """B robots in physics. A robot that fails stops, and keeps its last state, while the others go on.
+    """B robots in physics. One that is stopped, as it failed or its run has ended, keeps its state; the others go on.
 
     Attributes:
-        state: One record of `PLANT` for each robot; `reading`, `applied`, `current` and `failed` are views of it.
+        state: One record of `PLANT` for each robot; `reading`, `applied`, `current` and `stopped` are views of it.
         models: The world of each robot with the nominal robot; where the obstacles are the same, so is the object.
         robot: The nominal robot, which is all that a controller may know.
         truth: The perturbed robots, for the prior `true_model`.
         reading: One record of `READING` for each robot, current after `reset` and `step`.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
         current: Armature currents left and right at the end of the last control period, `(B, 2)` in A.
-        failed: Whether each robot has stopped, `(B,)`.
+        stopped: Whether each robot has stopped, `(B,)`.
         failure: Why each robot failed, or "".
-        running: Number of robots that have not failed.
+        running: Number of robots that have not stopped.
         imu: Position of the inertial sensor in the frame of the chassis in m, `(3,)`.
     """
 
@@ -187,7 +187,7 @@ class Plant(ABC):
         self.robot = robot
         self.truth = [robot] * size
         self.state = state = np.zeros(size, PLANT)
-        self.reading, self.failed = state["reading"], state["failed"]
+        self.reading, self.stopped = state["reading"], state["stopped"]
         self.applied, self.current = state["applied"], state["current"]
         self.failure = [""] * size
         self.running = size
@@ -310,8 +310,8 @@ class Plant(ABC):
         Raises:
             InputError: There is no ground below the pose, or an obstacle is in the way.
         """
-        if self.failed[robot]:
-            self.failed[robot], self.failure[robot] = False, ""
+        if self.stopped[robot]:
+            self.stopped[robot], self.failure[robot] = False, ""
             self.running += 1
         self._pushes.pop(robot, None)
         self._clear(robot)
@@ -363,21 +363,21 @@ class Plant(ABC):
         """
         if faults:
             for robot, reason in faults.items():
-                self.fail(robot, reason)
+                self.stop(robot, reason)
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
         # The engine would silently replace NaN by 0 V.
         if not self._send(command, self._tick, self._held.place):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
-                self.fail(int(robot), "non-finite command")
+                self.stop(int(robot), "non-finite command")
 
     def advance(self) -> None:
         """Advances physics by one control period; others that do so call `move_obstacles` before, `collide` after."""
         if self.running:
             self.move_obstacles(1)
             for robot, reason in self._advance().items():
-                self.fail(robot, reason)
+                self.stop(robot, reason)
             self.collide()
 
     def move_obstacles(self, ahead: int) -> None:
@@ -392,7 +392,7 @@ class Plant(ABC):
         """Fails robots whose hull has touched an obstacle in the last physics step."""
         if self._collision >= 0:
             for robot in np.flatnonzero(self.sensors[:, self._collision]):
-                self.fail(int(robot), "collision")
+                self.stop(int(robot), "collision")
 
     def look(self) -> None:
         """Updates the readouts after the physics; fails robots that have tilted or whose state is not finite."""
@@ -402,12 +402,12 @@ class Plant(ABC):
         if not self._look(0, self.size, self._period, self._held.place):
             upright = self.reading["upright"]
             for robot in np.flatnonzero(~(upright > MIN_COS_TILT)):
-                self.fail(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
+                self.stop(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
 
-    def fail(self, robot: int, reason: str) -> None:
+    def stop(self, robot: int, reason: str) -> None:
         """Stops one robot until it restarts; the first reason counts."""
-        if not self.failed[robot]:
-            self.failed[robot], self.failure[robot] = True, reason
+        if not self.stopped[robot]:
+            self.stopped[robot], self.failure[robot] = True, reason
             self.running -= 1
 
     def contacts(self, robot: int) -> Contacts:
@@ -526,7 +526,7 @@ class BatchPlant(Plant):
         self.batch.reset(np.array([robot]), stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def _advance(self) -> dict[int, str]:
-        ids = None if self.running == self.size else np.flatnonzero(~self.failed)
+        ids = None if self.running == self.size else np.flatnonzero(~self.stopped)
         self._tell()
         try:
             self.batch.step(ids, self.substeps)

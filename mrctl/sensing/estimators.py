@@ -362,7 +362,7 @@ class Estimator:
     def _locate(self, tick: int, plant: Rows) -> None:
         """Scans, and makes fixes from the scans, where there are lidars."""
         if self.scanner:
-            self.scanner.scan(tick, plant["reading"]["pose"], plant["failed"])
+            self.scanner.scan(tick, plant["reading"]["pose"], plant["stopped"])
         if self.localiser:
             self.localiser.locate(tick, self.seen["estimate"])
 

@@ -22,8 +22,11 @@ from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.control.weights import MAX_BYTES
 from mrctl.loop import user_files
+from mrctl.loop.groups import arranged, cores
 from mrctl.loop.hindsight import best_fixed
-from mrctl.loop.simulation import Simulation, arranged, cores, simulate, titles
+from mrctl.loop.outcome import titles
+from mrctl.loop.runs import simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.physics import mjcf
 from mrctl.physics.files import robot_path, world_path
 from mrctl.record import InputError, printable, read_file

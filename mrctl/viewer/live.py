@@ -17,7 +17,7 @@ from typing_extensions import override
 from viser._messages import HotkeyKey
 
 from mrctl.kernel import Array, Rows
-from mrctl.loop.simulation import arranged, suited
+from mrctl.loop.groups import arranged, suited
 from mrctl.loop.timeline import CHANGEABLE, begun, ends, followed, state
 from mrctl.navigation.planning import Avoid
 from mrctl.physics.files import SHIPPED

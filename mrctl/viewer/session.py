@@ -13,7 +13,9 @@ from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
 from mrctl.control.stages import MotionStage, Stages
 from mrctl.kernel import Array, Rows
-from mrctl.loop.simulation import Simulation, arranged, run, uniform
+from mrctl.loop.groups import arranged, uniform
+from mrctl.loop.runs import run
+from mrctl.loop.simulation import Simulation
 from mrctl.loop.timeline import followed, state
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
@@ -237,7 +239,7 @@ class Session:
             x and y in m and θ in rad; and the twist that it is asked for now, V in m/s and θ̇ in rad/s.
         """
         sim, k = self._place[0]
-        if sim.plant.failed[k]:
+        if sim.plant.stopped[k]:
             raise InputError(f"{what}: the first robot has stopped; a reset starts again")
         (x, y, theta), (v, omega) = sim.plant.reading["pose"][k].tolist(), sim.hierarchy.command[k].tolist()
         x, y, theta, *_ = advance.compiled(x, y, theta, v, omega, 0.0, 0.0, self.preview * self.period)
@@ -313,7 +315,7 @@ class Session:
         """
         found = np.full((self.size, 8, 2), np.nan)
         for rows, sim in self.simulations:
-            if (coefficients := sim.parameters()) is not None:
+            if (coefficients := sim.outcome.parameters()) is not None:
                 found[rows] = coefficients[0] - coefficients[1]
         return None if np.isnan(found).all() else found
 
@@ -353,7 +355,7 @@ class Session:
     def contacts(self, row: int) -> Contacts:
         """Returns what a robot touches now; nothing once it has stopped."""
         sim, k = self._place[row]
-        return NO_CONTACTS if sim.plant.failed[k] else sim.plant.contacts(k)
+        return NO_CONTACTS if sim.plant.stopped[k] else sim.plant.contacts(k)
 
     def considered(self, row: int) -> tuple[Array, Array] | None:
         """Returns the ways that the avoider of a robot considered last, from the samples that it drew itself.

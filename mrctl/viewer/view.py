@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation.mission import Order
 from mrctl.navigation.planning import prepared as prepare
 from mrctl.scenario import FeedforwardName, Scenario

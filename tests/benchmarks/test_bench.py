@@ -44,7 +44,7 @@ def test_replay(size, threads):
         assert simulation.tick == bench.WARM_TICKS + 60
         assert (np.abs(simulation.plant.qpos[:, :2] - start[:, :2]).max(axis=1) > 0.05).all()  # they drive
         assert (simulation.hierarchy.weight_norm > 0).all()  # and learn
-        assert not simulation.plant.failed.any()
+        assert not simulation.plant.stopped.any()
 
 
 def test_replay_can_fail():

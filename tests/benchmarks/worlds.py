@@ -8,7 +8,7 @@ import statistics
 import time
 
 from mrctl import Scenario
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.navigation.planning import prepared
 from mrctl.navigation.tasks import task_of
 

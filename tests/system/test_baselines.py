@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, Circle, Event, Lemniscate, Perturbation, Scenario, Sensing, StopAndGo, per_lap
-from mrctl.loop.simulation import Simulation, simulate
+from mrctl.loop.runs import simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.results.excitation import excitation, parameter_error
 from mrctl.scenario import FEEDFORWARDS
 

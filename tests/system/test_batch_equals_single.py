@@ -27,7 +27,9 @@ from mrctl import (
     StopAndGo,
     Sweep,
 )
-from mrctl.loop.simulation import Simulation, group_of, simulate, uniform
+from mrctl.loop.groups import group_of, uniform
+from mrctl.loop.runs import simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.physics.obstacles import layout
 from mrctl.physics.plant import BatchPlant, PhysicsPlant
 from mrctl.results.dataset import SIGNALS

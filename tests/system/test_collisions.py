@@ -127,7 +127,7 @@ def test_verdict_of_driven_runs(count, size):
         simulation = Simulation([own.replace(seed=size * k + row) for row in range(size)])
         corners, plant = footprint(mjcf.load(**list(ROBOTS.values())[k % 3])), simulation.plant
         while plant.running and simulation.tick < simulation.ticks:
-            running = np.flatnonzero(~plant.failed)
+            running = np.flatnonzero(~plant.stopped)
             simulation.step()
             time = np.array([simulation.tick * own.control_period])
             poses = [s.course.sample(time).pose[0] if s.course else np.zeros(3) for s in shapes]

@@ -16,7 +16,7 @@ from mrctl import (
     replicates,
 )
 from mrctl.experiments.paper import IDEAL
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 
 pytestmark = pytest.mark.xdist_group("composite_loop")  # what its tests share is made once
 

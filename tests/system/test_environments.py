@@ -33,7 +33,8 @@ from mrctl import (
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
 from mrctl.envs.episodes import ACTION_KINDS, EPISODE_METRICS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
-from mrctl.loop.simulation import arranged, simulate
+from mrctl.loop.groups import arranged
+from mrctl.loop.runs import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sensing.tiers import Sensing
 

@@ -22,7 +22,8 @@ from mrctl import (
     simulate,
 )
 from mrctl.cli import main
-from mrctl.loop.simulation import Simulation, suited
+from mrctl.loop.groups import suited
+from mrctl.loop.simulation import Simulation
 from mrctl.physics.tyres import measure
 from mrctl.results.dataset import GAIN_VARIABLES, SIGNALS
 from mrctl.scenario import replicates
@@ -56,7 +57,7 @@ def watched(scenarios):
         arrived = ~np.isnan(seen["fix"][:, 0])
         innovations[tick] = np.where(arrived, simulation.estimator.memory["nis"], np.nan)
         simulation.step()
-    return errors, covariances, innovations, simulation.plant.failed.copy()
+    return errors, covariances, innovations, simulation.plant.stopped.copy()
 
 
 def normalised(errors, covariances, states=slice(None)):
@@ -193,7 +194,7 @@ def test_radii_of_nominal_robots_are_not_doubted(tier, localisation):
         means = simulation.estimator.memory["drift"].copy()  # which begin again at exactly 0
         doubts += np.sum((means == 0).all(axis=1) & (before != 0).any(axis=1))
         before = means
-    assert not simulation.plant.failed.any() and doubts <= 1
+    assert not simulation.plant.stopped.any() and doubts <= 1
 
 
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within

@@ -5,7 +5,8 @@ import pytest
 
 from mrctl import Circle, Event, Fel, InputError, Kanayama, Line, Perturbation, Pid, Scenario
 from mrctl.experiments.paper import IDEAL
-from mrctl.loop.simulation import Simulation, simulate
+from mrctl.loop.runs import simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.physics import mjcf
 from mrctl.physics.perturb import fields
 from mrctl.results.dataset import SIGNALS

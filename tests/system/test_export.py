@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 import mrctl
 from mrctl import Circle, Event, InputError, Scenario, Sweep, save
 from mrctl.cli import main
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.results.export import UNMEASURED, export
 from mrctl.sensing.tiers import Sensing

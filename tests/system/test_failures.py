@@ -5,7 +5,7 @@ import pytest
 
 from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario, Sweep, per_lap
 from mrctl.control.feedforward import Loop, NoLearner
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 

@@ -8,7 +8,8 @@ from mrctl.control.features import FEATURES, REGRESSORS
 from mrctl.control.fel import HEADING_GAIN
 from mrctl.control.weights import initial_weights, unflatten
 from mrctl.experiments.paper import IDEAL
-from mrctl.loop.simulation import Simulation, simulate
+from mrctl.loop.runs import simulate
+from mrctl.loop.simulation import Simulation
 
 pytestmark = pytest.mark.xdist_group("learning")  # what its tests share is made once
 

@@ -17,7 +17,7 @@ from test_batch_equals_single import equal
 import mrctl
 from mrctl import Disc, InputError, Line, Obstacles, Scenario, Sweep, simulate
 from mrctl.loop import user_files
-from mrctl.loop.simulation import arranged, uniform
+from mrctl.loop.groups import arranged, uniform
 from mrctl.navigation.planning import prepared
 from mrctl.navigation.tasks import task_of
 from mrctl.results.dataset import SIGNALS

@@ -14,7 +14,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from mrctl import Box, Disc, InputError, Line, Obstacles, Scenario
 from mrctl.envs.dm_env import SUITE, Environment, Navigation
 from mrctl.envs.gym import NavigationEnv, NavigationVectorEnv
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results.dataset import SIGNALS
 
 CROSSING = Disc(x=-1.0, y=2.0, radius=0.2, course=Line(speed=0.8))

@@ -6,7 +6,7 @@ from test_batch_equals_single import equal
 
 import mrctl
 from mrctl import Box, Disc, Event, Obstacles, Scenario, simulate
-from mrctl.loop.simulation import arranged, uniform
+from mrctl.loop.groups import arranged, uniform
 from mrctl.navigation import avoiders
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from mrctl import cli
 from mrctl.experiments import kanayama, paper
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.scenario import Scenario
 from mrctl.theory.references import Circle
 

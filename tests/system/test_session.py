@@ -8,7 +8,7 @@ import pytest
 
 from mrctl import FEEDFORWARDS, Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
 from mrctl.control.features import FEATURE_NAMES
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.results.excitation import alone, parameter_error
 from mrctl.results.metrics import per_lap

@@ -18,7 +18,7 @@ from mrctl.control.steering import ALLOCATION, allocate, steer
 from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop import user_files
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results.dataset import GAIN_VARIABLES, SIGNALS
 from mrctl.scenario import FEEDFORWARDS
 from mrctl.sweep import jobs

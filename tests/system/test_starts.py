@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mrctl import Box, Circle, Disc, InputError, Obstacles, RobotFile, Scenario, Sensing
-from mrctl.loop.simulation import Simulation, simulate
+from mrctl.loop.runs import simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.navigation.planning import prepared
 from mrctl.navigation.tasks import task_of
 

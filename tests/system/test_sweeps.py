@@ -28,7 +28,7 @@ import xarray as xr
 
 import mrctl
 from mrctl import InputError, Sweep, cli
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.physics.files import models_folder
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs

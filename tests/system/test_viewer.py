@@ -15,7 +15,7 @@ from PIL import Image
 from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
 from mrctl.control.features import FEATURE_NAMES
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.results.excitation import alone
 from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing

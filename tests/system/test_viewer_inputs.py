@@ -10,7 +10,7 @@ import pytest
 import viser
 
 from mrctl import Event, Kanayama, Line, Perturbation, Pid, Scenario, per_lap, save_learned, simulate
-from mrctl.loop.simulation import arranged
+from mrctl.loop.groups import arranged
 from mrctl.loop.timeline import CHANGEABLE
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot

@@ -161,7 +161,7 @@ def drive(model, robot, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
     plant.reset(np.zeros((1, 3)), np.array([twist]))
     for _ in range(round(100 * seconds)):
         plant.step(np.array([[*volts, steering, 0.0]]))
-    assert not plant.failed.any(), plant.failure
+    assert not plant.stopped.any(), plant.failure
     return plant.reading[0].copy()
 
 

@@ -64,7 +64,7 @@ def test_wall():
     plant = build([model], ROBOT, 1, obstacles=[wall])
     plant.reset(np.zeros((1, 3)), np.array([[0.5, 0.0]]))
     for _ in range(1000):
-        if not plant.failed[0]:
+        if not plant.stopped[0]:
             plant.step(np.array([[12.0, 12.0, 0.0, 0.0]]))
     assert plant.failure[0] == "collision"
     places, forces, _ = plant.contacts(0)

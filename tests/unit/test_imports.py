@@ -78,7 +78,7 @@ def test_walk() -> None:
     """The walk sees what is known to be there."""
     assert {"control.fel", "physics.plant", "scenario"} <= MODULES.keys()
     assert {"record", "theory.robot"} <= inside(imports(MODULES["theory.references"]))
-    assert {"physics.mjcf", "results.dataset", "physics.plant"} <= inside(imports(MODULES["loop.simulation"]))
+    assert {"physics.hull", "results.dataset", "physics.plant"} <= inside(imports(MODULES["loop.outcome"]))
 
 
 def test_arrows() -> None:

@@ -21,7 +21,8 @@ from mrctl import Event, Line, Scenario, Sensing
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
 from mrctl.kernel import Held, Kernel, kernel, over_rows
 from mrctl.loop.announcement import announced, called
-from mrctl.loop.simulation import Simulation, run, simulate
+from mrctl.loop.runs import run, simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.physics.files import models_folder
 
 PACKAGE = Path(mrctl.__file__).parent

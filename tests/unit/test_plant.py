@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Scenario
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
 from mrctl.physics.files import models_folder
@@ -243,10 +243,10 @@ def test_non_finite_command(command):
         before = plant.qpos[-1].copy()
         for _ in range(3):
             plant.step(commands)
-        assert plant.failed[-1] and plant.failure[-1] == "non-finite command"
+        assert plant.stopped[-1] and plant.failure[-1] == "non-finite command"
         assert np.array_equal(plant.qpos[-1], before)
         if plant.size > 1:
-            assert not plant.failed[:-1].any() and (plant.qpos[:-1, 0] > 0).all()
+            assert not plant.stopped[:-1].any() and (plant.qpos[:-1, 0] > 0).all()
 
 
 def test_tilt():
@@ -255,8 +255,8 @@ def test_tilt():
         plant.qpos[-1, 3:7] = math.cos(0.3), math.sin(0.3), 0, 0
         plant.qpos[-1, 2] = 0.5
         plant.step(volts(plant, 0.0))
-        assert plant.failure[-1] == "tilt over 30°" and plant.failed.sum() == 1
-        plant.fail(plant.size - 1, "something else")
+        assert plant.failure[-1] == "tilt over 30°" and plant.stopped.sum() == 1
+        plant.stop(plant.size - 1, "something else")
         assert plant.failure[-1] == "tilt over 30°"
 
 

@@ -13,7 +13,8 @@ import xarray as xr
 import mrctl
 from mrctl import Circle, Event, Fel, Perturbation, Pid, Scenario
 from mrctl.control.design import motion
-from mrctl.loop.simulation import arranged, simulate
+from mrctl.loop.groups import arranged
+from mrctl.loop.runs import simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError
 from mrctl.results.dataset import GAIN_VARIABLES, SIGNALS, open_result, save, scenarios_of, versions

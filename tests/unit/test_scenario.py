@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario
 from mrctl.control.feedforward import Loop, NoLearner
-from mrctl.loop.simulation import simulate
+from mrctl.loop.runs import simulate
 from mrctl.record import InputError, is_whole
 from mrctl.scenario import MAX_TICKS, replicates
 from mrctl.sensing.tiers import Sensing
