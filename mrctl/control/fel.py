@@ -35,29 +35,32 @@ from mrctl.record import Record
 HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
 HEADING_GAIN = 0.4  # g_θ on top of a model; with a small one gravity is learned slowly, with 1 everything else is
 INPUTS = FEATURES + 2  # x and h
+SLOPES = CHANNELS * 2  # numbers in W₄
 REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the regressor vanishes
 
 
 @kernel
-def places(units: int) -> tuple[int, int, int, int]:
-    """Returns where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` begin, after W₁ᵀ `(8, units)`.
+def places(units: int) -> tuple[int, int, int, int, int]:
+    """Returns where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)`, W₃ `(2, 8)`, W₄ `(2, 2)` begin, after W₁ᵀ `(8, units)`.
 
-    The laws index the flat weights: to make views of the five layers would take as long as the network itself.
+    The laws index the flat weights: to make views of the six layers would take as long as the network itself.
     """
     b1 = units * FEATURES
     W2 = b1 + units
     b2 = W2 + CHANNELS * units
-    return b1, W2, b2, b2 + CHANNELS
+    W3 = b2 + CHANNELS
+    return b1, W2, b2, W3, W3 + CHANNELS * FEATURES
 
 
 def by_columns(weights: Array) -> Array:
-    """Returns flat weights of files and results, which begin with W₁, as those of the kernels, with W₁ᵀ, `(…, n)`."""
-    return _transposed(weights, rows=-1, columns=FEATURES)
+    """Returns flat weights of files and results, `(…, n)`, as those of kernels, with W₁ᵀ and W₄ = 0, `(…, n + 4)`."""
+    level = np.zeros((*weights.shape[:-1], SLOPES))
+    return np.concatenate([_transposed(weights, rows=-1, columns=FEATURES), level], axis=-1)
 
 
 def by_rows(weights: Array) -> Array:
-    """Returns the inverse of `by_columns`."""
-    return _transposed(weights, rows=FEATURES, columns=-1)
+    """Returns flat weights of kernels, `(…, n + 4)`, as those of files, which begin with W₁ and lack W₄, `(…, n)`."""
+    return _transposed(weights[..., :-SLOPES], rows=FEATURES, columns=-1)
 
 
 def _transposed(weights: Array, rows: int, columns: int) -> Array:
@@ -102,19 +105,18 @@ def inner(a: Array, start: int, b: Array) -> float:
 
 
 @kernel
-def network(inputs: Array, w: Array, incline: Array, hidden: Array, scale: Array, output: Array) -> None:
+def network(inputs: Array, w: Array, hidden: Array, scale: Array, output: Array) -> None:
     """The network: output = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x + W₄ h).
 
     Args:
         inputs: Scaled features x and heading h, `(10,)`.
         w: Flat weights, W₁ᵀ and then the layers at their `places`.
-        incline: W₄, `(2, 2)`.
         hidden: Out: tanh(W₁ x + b₁), `(units,)`.
         scale: Output for a network output of one, V (rad/s on a steering channel), `(2,)`.
         output: Out: feedforward of the two channels in the same units, `(2,)`.
     """
     units, x = hidden.shape[0], inputs[:FEATURES]
-    b1, W2, b2, W3 = places(units)
+    b1, W2, b2, W3, W4 = places(units)
     for j in range(units):
         z = w[b1 + j]
         for i in range(FEATURES):
@@ -122,7 +124,7 @@ def network(inputs: Array, w: Array, incline: Array, hidden: Array, scale: Array
         hidden[j] = tanh(z)
     for k in range(CHANNELS):
         direct = inner(w, W3 + k * FEATURES, x)
-        direct += incline[k, 0] * inputs[FEATURES] + incline[k, 1] * inputs[FEATURES + 1]
+        direct += w[W4 + 2 * k] * inputs[FEATURES] + w[W4 + 2 * k + 1] * inputs[FEATURES + 1]
         output[k] = scale[k] * (HIDDEN_GAIN * inner(w, W2 + k * units, hidden) + BIAS_GAIN * w[b2 + k] + direct)
 
 
@@ -130,24 +132,26 @@ def network(inputs: Array, w: Array, incline: Array, hidden: Array, scale: Array
 def backpropagate(inputs: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> float:
     """Writes Jᵀe, with J = ∂(output/scale)/∂W of the network, in the order of the weights.
 
-        Jᵀe = (δ xᵀ, δ, g_h e aᵀ, g_b e, e xᵀ),    δ = g_h (1 − a²) ∘ W₂ᵀe,    a = tanh(W₁ x + b₁)
+        Jᵀe = (δ xᵀ, δ, g_h e aᵀ, g_b e, e xᵀ, e hᵀ),    δ = g_h (1 − a²) ∘ W₂ᵀe,    a = tanh(W₁ x + b₁)
 
     Args:
         inputs: Scaled features x and heading h, `(10,)`.
         w: Flat weights, `(n,)`.
         hidden: Activations a at x, as from `network`, `(units,)`.
         error: e, `(2,)`.
-        gradient: Out: Jᵀe, `(n,)`, but for W₄, where it is e hᵀ.
+        gradient: Out: Jᵀe, `(n,)`.
 
     Returns:
-        ‖Jᵀe‖² with W₄, where the squared norm of an outer product is the product of those of its factors.
+        ‖Jᵀe‖²; the squared norm of an outer product is the product of those of its factors.
     """
     units, x = hidden.shape[0], inputs[:FEATURES]
-    b1, W2, b2, W3 = places(units)
+    b1, W2, b2, W3, W4 = places(units)
     for k in range(CHANNELS):
         gradient[b2 + k] = BIAS_GAIN * error[k]
         for i in range(FEATURES):
             gradient[W3 + k * FEATURES + i] = error[k] * x[i]
+        for j in range(2):
+            gradient[W4 + 2 * k + j] = error[k] * inputs[FEATURES + j]
         for j in range(units):
             gradient[W2 + k * units + j] = HIDDEN_GAIN * error[k] * hidden[j]
     for j in range(units):
@@ -174,7 +178,7 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
     Args:
         feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
         s: In and out: a record of `FEL` with the inputs `x` of this tick, the network's `output` there, which is
-            renewed, the delayed inputs `past`, and W₄, which W includes and which begins at zero.
+            renewed, and the delayed inputs `past`.
         w: In and out: flat weights W, `(n,)`.
         initial: Initial weights W₀, `(n,)`.
         hidden: Scratch, `(units,)`.
@@ -186,27 +190,19 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
         power += s.error[k] * s.error[k]
     if power == 0:
         return
-    network(s.past, w, s.incline, hidden, s.scale, s.output)
+    network(s.past, w, hidden, s.scale, s.output)
     square = backpropagate(s.past, w, hidden, s.error, gradient)
     rate, leak = s.step / (square / power + REGULARISATION), s.leak
     distance = gradient  # from here on W − W₀, in the same memory
     for n in range(w.shape[0]):
         w[n] += rate * gradient[n] - leak * (w[n] - initial[n])
         distance[n] = w[n] - initial[n]
-    total = inner(distance, 0, distance)
-    for k in range(CHANNELS):
-        for j in range(2):
-            s.incline[k, j] += rate * s.error[k] * s.past[FEATURES + j] - leak * s.incline[k, j]
-            total += s.incline[k, j] * s.incline[k, j]
-    s.norm = np.sqrt(total)
+    s.norm = np.sqrt(inner(distance, 0, distance))
     if s.norm > s.bound:
         for n in range(w.shape[0]):
             w[n] = initial[n] + (w[n] - initial[n]) * s.bound / s.norm
-        for k in range(CHANNELS):
-            for j in range(2):
-                s.incline[k, j] *= s.bound / s.norm
         s.norm = s.bound
-    network(s.x, w, s.incline, hidden, s.scale, s.output)
+    network(s.x, w, hidden, s.scale, s.output)
 
 
 @kernel
@@ -215,7 +211,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     rows, scale, weights, _, hidden, _, _ = arrays
     s = rows[i]
     features(command, derivative, robot.half_track, scale, s.x)
-    network(s.x, weights[i], s.incline, hidden[i], s.scale, s.output)
+    network(s.x, weights[i], hidden[i], s.scale, s.output)
     voltage[0], voltage[1] = s.output[0], s.output[1]
 
 
@@ -281,7 +277,6 @@ FEL = np.dtype(
         ("norm", "f8"),  # ‖W − W₀‖
         ("heading", "f8"),  # θ by dead reckoning from the start, rad
         ("heading_gain", "f8"),  # g_θ; 0 without a model
-        ("incline", "f8", (CHANNELS, 2)),  # W₄
     ],
     align=True,
 )
@@ -304,9 +299,9 @@ class FeedbackErrorLearning(Learner):
     """The learner `fel` for B robots.
 
     Attributes:
-        weights: Flat weights W but for W₄, in the order of the kernels, `(B, n)`.
+        weights: Flat weights W, in the order of the kernels, `(B, n)`.
         initial: Initial weights W₀, to which leak and projection refer, in the same order, `(B, n)`.
-        weight_norm: ‖W − W₀‖, with W₄, `(B,)`.
+        weight_norm: ‖W − W₀‖, `(B,)`.
     """
 
     respond, learn_one, record = respond, learn, FEL
@@ -335,15 +330,14 @@ class FeedbackErrorLearning(Learner):
         return shapes(settings.hidden)
 
     def adapted(self) -> Array:
-        """The weights but for W₄, `(B, n)`, in the order of files."""
+        """The weights but for W₄, in the order of files, `(B, n − 4)`."""
         return by_rows(self.weights)
 
     def adopt(self, row: int, learned: Array) -> None:
         """Starts one robot from other weights, to which leak and projection then refer, and without W₄."""
-        self.rows["incline"][row] = 0.0
         self.weights[row] = self.initial[row] = by_columns(learned)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights."""
-        self.weights[rows], self.rows["incline"][rows] = self.initial[rows], 0.0
+        self.weights[rows] = self.initial[rows]
         self.rows["tick"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0, 0.0, 0.0

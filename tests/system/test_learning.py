@@ -137,12 +137,12 @@ def test_torch_module(runs):
 
 
 INCLINES = {
-    "fel": lambda s: HEADING_GAIN * s["scale"][0] * s["incline"][0],
-    "rls": lambda s: s["theta"][FEATURES:, 0],
-    "mrac": lambda s: s["b"][FEATURES:, 0],
-    "composite": lambda s: s["a"][0, FEATURES:REGRESSORS],
+    "fel": lambda learner: HEADING_GAIN * learner.rows["scale"][0, 0] * learner.weights[0, -4:-2],
+    "rls": lambda learner: learner.rows["theta"][0, FEATURES:, 0],
+    "mrac": lambda learner: learner.rows["b"][0, FEATURES:, 0],
+    "composite": lambda learner: learner.rows["a"][0, 0, FEATURES:REGRESSORS],
 }
-"""Voltage that a learner has for the cosine and the sine of the heading, from its record."""
+"""Voltage that a learner has for the cosine and the sine of the heading."""
 
 
 @pytest.mark.parametrize("learner", INCLINES)
@@ -156,9 +156,9 @@ def test_slope(learner):
     simulation = Simulation([base.replace(learner=learner)])
     while simulation.running:
         simulation.step()
-    robot, row = simulation.plant.robot, simulation.hierarchy.learner.rows[0]
+    robot, found = simulation.plant.robot, INCLINES[learner](simulation.hierarchy.learner)
     gravity = robot.mass * robot.gravity * np.sin(0.1) * robot.wheel_radius / 2 / robot.motor_gain
-    np.testing.assert_allclose(INCLINES[learner](row), gravity * np.sqrt(0.5) * np.array([1, -1]), rtol=0.1)
+    np.testing.assert_allclose(found, gravity * np.sqrt(0.5) * np.array([1, -1]), rtol=0.1)
     learning, without = (
         per_lap(run)[["v_rmse", "position_rmse"]].isel(run=0, lap=-1).to_array().values
         for run in (simulation.result(), simulate([base.replace(learner="none")]))

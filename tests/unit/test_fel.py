@@ -57,16 +57,15 @@ def whole(hidden=HIDDEN):
     return np.append(trained(hidden), np.random.default_rng(1).normal(0, 0.5, 4))
 
 
-def apart(weights):
-    """The weights of the kernels, and W₄."""
-    return by_columns(weights[:-4]), weights[-4:].reshape(2, 2).copy()
+def compiled(weights):
+    """The same weights in the order of the kernels."""
+    return np.append(by_columns(weights[:-4])[:-4], weights[-4:])
 
 
 def answer(x, weights, scale):
     """Output of the network `(2,)` at features and heading, with W₄ at the end of the weights."""
     output = np.zeros(2)
-    w, incline = apart(weights)
-    network(x, w, incline, np.zeros(HIDDEN), np.array(scale, float), output)
+    network(x, compiled(weights), np.zeros(HIDDEN), np.array(scale, float), output)
     return output
 
 
@@ -76,12 +75,11 @@ def one_step(x, feedback, weights, rigid=False, prior=None, **settings):
     Their last four are W₄, whose prior is zero.
     """
     s = fresh([Fel(**{"step": 0.05, "leak": 0.0, "weight_bound": 1e4} | settings)], rigid)[0]
-    after, s["incline"] = apart(weights)
-    hidden, initial = np.zeros(HIDDEN), by_columns((weights if prior is None else prior)[:-4])
+    after, hidden, initial = compiled(weights), np.zeros(HIDDEN), by_columns((weights if prior is None else prior)[:-4])
     s["x"] = s["past"] = x
-    network(s["x"], after, s["incline"], hidden, s["scale"], s["output"])
+    network(s["x"], after, hidden, s["scale"], s["output"])
     update(np.array(feedback, float), s, after, initial, hidden, np.zeros(len(initial)))
-    return np.append(by_rows(after), s["incline"]), float(s["norm"])
+    return np.append(by_rows(after), after[-4:]), float(s["norm"])
 
 
 def teach(stage, feedback, frozen=0.0):
@@ -270,7 +268,7 @@ def test_projection_keeps_direction():
 def test_rows(robot, motion, feedback, data):
     """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
     frozen = data.draw(arrays(float, 4, elements=st.sampled_from([0.0, 1.0])))
-    prior = np.stack([np.random.default_rng(i).normal(0, 0.5, 84) for i in range(4)])
+    prior = np.stack([np.random.default_rng(i).normal(0, 0.5, 88) for i in range(4)])
     settings = Fel(hidden=HIDDEN, step=0.1, leak=1e-3, weight_bound=0.2)
 
     def after(rows, lost=()):
