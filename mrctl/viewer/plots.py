@@ -226,10 +226,10 @@ class Plots:
             within: Samples that are drawn.
         """
         drawn = time[within][::step]
-        marks = np.full(len(drawn), -1, np.int8)  # below the chart, since uPlot draws a line across NaN
-        for first in np.searchsorted(drawn, events):
-            if 0 < first < len(drawn):
-                marks[first] = 1
+        marks = np.full(len(drawn), -1, np.int8)  # below or above the chart: a line that crosses it marks an event
+        for first in np.unique(np.searchsorted(drawn, events)):
+            if first > 0:
+                marks[first:] *= -1
         found = charts(log, self._robots, self._period, clearance, self._own_references)
         for handle, chart in zip(self._handles, found, strict=True):
             values = [time, *(curve.values for curve in chart.curves)]
@@ -279,7 +279,9 @@ def _series(chart: Chart) -> tuple[uplot.Series, ...]:
         )
         for c in chart.curves
     ]
-    marks = uplot.Series(label="event", scale="event", stroke=f"rgb{EVENT_COLOUR}", width=1.5, points=points)
+    marks = uplot.Series(
+        label="event", scale="event", stroke=f"rgb{EVENT_COLOUR}", width=1.5, dash=(5, 4), points=points
+    )
     return uplot.Series(label="s"), *curves, marks
 
 
@@ -297,7 +299,7 @@ def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
         tuple(np.zeros(2) for _ in series),
         series,
         title=chart.title,
-        scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}, "event": {"range": (0.0, 1.0)}},
+        scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}, "event": {"range": (-0.5, 0.5)}},
         axes=({"size": 24, "ticks": {"size": 4}}, {"size": 56, "ticks": {"size": 4}, "space": 16}),  # px
         height=112,
         padding=(8, 18, 0, 0),  # to the right for half of the last time

@@ -168,6 +168,21 @@ def test_another_learner_than_that_of_the_file(live, tmp_path):
     assert [(s.learner, s.learned) for s in live.session.start] == [("fel", None), ("none", None)]
 
 
+def test_marks_of_events(live):
+    """A line crosses each chart at each event, once where two fall into one sample."""
+    live._restart([Scenario()])
+    for button in (("Payload", "drop payload"), ("Supply", "sag supply"), ("Push", "push")):
+        for _ in range(0 if "sag supply" in button else 60):
+            live.session.step()
+        live._press(*button)
+    for _ in range(60):
+        live.session.step()
+    live._show_past()
+    for handle in live._plots._handles:
+        time, marks = handle.data[0], handle.data[-1]
+        assert time[1:][np.diff(marks) != 0] == pytest.approx([0.6, 1.2], abs=0.06) and {*marks} == {-1, 1}
+
+
 def test_typing(live):
     """While somebody types 0.05, what is below the limit yet neither changes nor resets anything."""
     live._restart([Scenario()])
