@@ -126,20 +126,20 @@ def charts(
     position = [1e3 * np.hypot(signal("longitudinal_error", r), signal("lateral_error", r)) for r in shown]
     near = [] if clearance is None else [each("clearance", [clearance[:, r] for r in shown])]
     return [
+        Chart("position error, mm", each("position error", position), (0.0, 1.0)),
         tracked("V, m/s", "v", (0.0, 0.1)),
         tracked("θ̇, rad/s", "omega", (-0.1, 0.1)),
-        Chart("position error, mm", each("position error", position), (0.0, 1.0)),
         *(Chart("clearance, m", curves, (0.0, 0.1)) for curves in near),
         Chart("share of the voltage that is feedback, last second", each("share", shares), (0.0, 1.0)),
-        voltages("common voltage Σ, mean of left and right, V", 1.0),
-        voltages("difference Δ, half of right less left, V", -1.0),
+        voltages("Σ, mean of left and right, V; feedforward dashed", 1.0),
+        voltages("Δ, half of right less left, V; feedforward dashed", -1.0),
         Chart(
             "norm of the learned weights, ‖W‖",
             each("weight norm", [signal("weight_norm", r) for r in shown]),
             (0.0, 0.1),
         ),
         Chart(
-            "saturated, guard (dashed)",
+            "saturated; guard dashed",
             each("saturated", [signal("saturated", r) for r in shown])
             + each("guard", [signal("guard", r) for r in shown], dashed=True),
             (0.0, 1.0),
@@ -264,7 +264,7 @@ def legend(robots: Sequence[Look], own_references: bool) -> str:
     keys += [f'<span style="{whole}{REFERENCE_COLOUR}">■ reference</span>']
     keys += ["V, θ̇: reference of each robot dashed."] * own_references
     keys += [f'<span style="{whole}{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
-    keys += ["Σ, Δ: feedback solid, feedforward dashed. Time in s."]
+    keys += ["Time in s."]
     if len(robots) > MAX_ROBOTS:
         keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]
     return f'<p style="margin:0.3em 1em;max-height:6em;overflow:auto">{" &nbsp; ".join(keys)}</p>'

@@ -12,18 +12,16 @@ from mrctl.kernel import Array, Rows
 from mrctl.loop.goals import arrived
 from mrctl.loop.timeline import begun, ends, followed
 from mrctl.results.excitation import alone
-from mrctl.results.metrics import excitation, lap_metrics
+from mrctl.results.metrics import lap_metrics
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
 
 LAP_SCORES = (
     "error now, mm", "RMS of last lap, mm", "best lap, mm", "feedback in last lap, %", "energy of last lap, J",
-    "excitation in last lap",
 )  # fmt: skip
 WAY_SCORES = (
     "off the timed plan now, mm", "RMS of that on the way, mm", "feedback on the way, %", "energy on the way, J",
-    "excitation on the way",
 )  # fmt: skip
 # s, and a share of a way, by which a robot drives on until its metrics are computed again
 FRESH_TIME, FRESH_SHARE = 1.0, 0.02
@@ -35,7 +33,7 @@ EXPONENT_BELOW = 1e-3  # below which a number is written with an exponent
 
 
 def one_lap(log: Rows, period: float, robot: Robot) -> dict[str, Array]:
-    """Returns the metrics `(B,)` of `results.metrics.METRICS` of a lap, by name, and `alone`, `(B, 8)`.
+    """Returns the metrics `(B,)` of `results.metrics.lap_metrics` of a lap, by name, and `alone`, `(B, 8)`.
 
     The last is the excitation of each feature alone, as of `results.excitation.alone`.
 
@@ -48,7 +46,7 @@ def one_lap(log: Rows, period: float, robot: Robot) -> dict[str, Array]:
     command = np.stack([data["v_command"], data["omega_command"]], axis=-1)
     size, scale = len(command), feature_scale(robot)
     motion = command, period, np.full(size, robot.half_track), np.tile(scale, (size, 1))
-    return lap_metrics(data, data, period) | {"excitation": excitation(*motion), "alone": alone(*motion)}
+    return lap_metrics(data, data, period) | {"alone": alone(*motion)}
 
 
 def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> tuple[list[dict[str, Array]], bool]:
@@ -139,7 +137,7 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]], w
     """
     nothing = np.full(len(robots), np.nan)
     errors = np.array([lap["position_rmse"] for lap in laps] or [nothing])
-    last = laps[-1] if laps else dict.fromkeys(("feedback_share", "energy", "excitation"), nothing)
+    last = laps[-1] if laps else dict.fromkeys(("feedback_share", "energy"), nothing)
     best = np.where(np.isnan(errors), np.inf, errors).min(axis=0)
     columns = [
         1e3 * np.hypot(now["longitudinal_error"], now["lateral_error"]),
@@ -147,7 +145,6 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]], w
         *([] if way else [1e3 * np.where(np.isfinite(best), best, np.nan)]),
         100 * last["feedback_share"],
         last["energy"],
-        last["excitation"],
     ]
     return _table("mrctl-score", "", robots, WAY_SCORES if way else LAP_SCORES, columns)
 
