@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
@@ -25,6 +26,9 @@ PLAN_FIELDS = ("start_speed", "start_curvature", "end_curvature", "cusp_curvatur
 NEW_RUN_MARK, NEW_RUN_HINT = " ↻", "A change begins another run."  # behind the label of what cannot change during a run
 SEED_FIELDS = ("seed",)  # a number that no slider suits
 STEERING = ("steering_offset", "steering_backlash")
+# The unit of a number in its description, and what ends the part of that which is about its value.
+UNIT = re.compile(r" in (1/\(V² s\)|(?:1/)?(?:kg|m|s|rad|V|A|Ω|Hz)(?![a-z])[/√²a-zH]*(?: √s| per rad/s)?)")
+ASIDE = re.compile(r"\. |; | \(")
 # Fields of large records in groups, by the name of the field that holds the record. The first group of a perturbation
 # is open; fields without a group stand above the groups.
 GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -84,6 +88,7 @@ class Controls:
         self._limits: dict[tuple[str, ...], Interval] = {}  # of the record
         self._sliders: dict[tuple[str, ...], tuple[FieldInfo, Interval]] = {}  # and the range of the slider
         self._inputs: dict[tuple[str, ...], Any] = {}
+        self._labels: dict[tuple[str, ...], str] = {}  # of numbers that follow from the design, when they are set
         self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
         self._buttons: dict[tuple[str, ...], viser.GuiButtonHandle] = {}
         self._records: dict[str, viser.GuiFolderHandle] = {}  # folders of the fields that are records, by first name
@@ -109,7 +114,7 @@ class Controls:
                     self._add(self._shown(record, (*path, name)), type(record).model_fields[name], (*path, name))
 
     def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
-        label, hint = self._label(path), self._hint(path, field)
+        label, hint = self._label(path, field), self._hint(path, field)
         if isinstance(value, Record):
             with self._gui.add_folder(_words(path), expand_by_default=len(path) == 1) as folder:
                 if len(path) == 1:
@@ -135,7 +140,7 @@ class Controls:
         elif isinstance(value, bool):
             handle = self._gui.add_checkbox(label, value, hint=hint)
         elif path in self.designed:
-            return self._add_designed(value, kind, path)
+            return self._add_designed(value, field, path)
         elif isinstance(value, int | float) and (limits := _limits(kind, _scale(path, value))):
             low, high, step = limits
             self._limits[path] = low, high
@@ -152,14 +157,15 @@ class Controls:
             return
         self._listen(path, handle, whole=kind.annotation is int)
 
-    def _add_designed(self, value: float | None, kind: FieldInfo, path: tuple[str, ...]) -> None:
+    def _add_designed(self, value: float | None, field: FieldInfo, path: tuple[str, ...]) -> None:
         """Adds the input of a number that follows from the design while it is not set, and the button to the design."""
         value = float(value or 0)
-        limits = _limits(kind, value / 10)  # three digits
+        limits = _limits(_kind(field), value / 10)  # three digits
         assert limits is not None
         low, high, step = limits
+        self._labels[path] = label = self._label(path, field)
         handle = self._gui.add_number(
-            self._label(path), value, min=min(low, value), max=max(high, value), step=step, hint=self._hint(path, kind)
+            label, value, min=min(low, value), max=max(high, value), step=step, hint=self._hint(path, field)
         )
         self._limits[path] = low, high
         self._buttons[path] = button = self._gui.add_button(f"{_words(path)} as designed", visible=False, color="gray")
@@ -170,9 +176,11 @@ class Controls:
             if event.client is not None:
                 self._on_change(path, None)
 
-    def _label(self, path: tuple[str, ...]) -> str:
-        """Returns the name of a field in words, with a mark if its change begins another run."""
-        return _words(path) if path[0] in self._changeable else _words(path) + NEW_RUN_MARK
+    def _label(self, path: tuple[str, ...], field: FieldInfo | None = None) -> str:
+        """Returns the name of a field in words and its unit, with a mark if its change begins another run."""
+        unit = UNIT.search(ASIDE.split(field.description or "")[0]) if field else None
+        label = f"{_words(path)}, {unit[1]}" if unit else _words(path)
+        return label if path[0] in self._changeable else label + NEW_RUN_MARK
 
     def _hint(self, path: tuple[str, ...], field: FieldInfo) -> str:
         """Returns the text that a page shows when the mouse is over an input: its description and its limits.
@@ -232,7 +240,7 @@ class Controls:
 
     def _show_design(self, path: tuple[str, ...], value: float | None, own: bool) -> None:
         """Says whether a field has a value of its own or that of the design, which may be beyond what may be set."""
-        handle, label = self._inputs[path], self._label(path)
+        handle, label = self._inputs[path], self._labels[path]
         _update(self._buttons[path], visible=own)
         _update(handle, label=label if own else f"{label} (designed)", visible=value is not None)
         if value is not None:  # a page would move a value that is beyond the limits of its input

@@ -133,7 +133,7 @@ def test_design(live, steering, tier):
 
     live._note_input(("kanayama", "k_y"), 9.0)
     live._apply_inputs()
-    assert inputs["kanayama", "k_y"].label == "k y" and live._controls._buttons["kanayama", "k_y"].visible
+    assert inputs["kanayama", "k_y"].label == "k y, 1/m²" and live._controls._buttons["kanayama", "k_y"].visible
     assert inputs["kanayama", "k_theta"].value == 6 and "designed → 9" in live._timeline.content
     live._note_input(("kanayama", "k_y"), None)
     live._apply_inputs()
@@ -208,11 +208,32 @@ def test_marks(live):
     )
 
 
+def test_units(live):
+    """The label of a number has the unit that its description says of it; shares and factors have none."""
+    labels = {path: handle.label.removesuffix(NEW_RUN_MARK) for path, handle in live._controls._inputs.items()}
+    for path, label in {
+        "perturbation.payload": "payload, kg",
+        "perturbation.mass_factor": "mass factor",
+        "sensing.start_position_noise": "start position noise, m",
+        "sensing.gyro_noise": "gyro noise, rad/s/√Hz",
+        "sensing.fix_outliers": "fix outliers",
+        "mrac.noise": "noise, V √s",
+        "mrac.radius": "radius",
+        "mrac.leak": "leak, 1/(V² s)",
+        "guard.oscillation": "oscillation",
+        "reference.waypoints.limits.acceleration": "acceleration, m/s²",
+    }.items():
+        assert labels[tuple(path.split("."))] == label
+    live._restart([Scenario(prefilter=0.1, steering="rigid", pid=Pid(steering_kp=1.0))])
+    assert live._controls._inputs["prefilter",].label == f"prefilter, s{NEW_RUN_MARK}"
+    assert live._controls._inputs["pid", "steering_kp"].label == "steering kp, rad/s per rad/s"
+
+
 def test_hints_say_the_limits(live):
     """The hint of a number says what the record accepts, so that a number that the page moves is no riddle."""
     live._restart([Scenario()])
     hints = {path: handle.hint for path, handle in live._controls._inputs.items()}
-    assert "At least 0.01, at most 10." in hints["prefilter",]
+    assert hints["prefilter",].startswith("Time constant") and "At least 0.01, at most 10." in hints["prefilter",]
     assert "At least 0.05, at most 20." in hints["perturbation", "mass_factor"]
     assert "at most" not in (hints["learner",] or "").lower()
 
