@@ -52,6 +52,7 @@ PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 SLIDER_REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
 TOUCH_HINT = "Blue: forces on the wheels, a robot's length for its weight. Red: slip, for a tenth of its top speed."
+WATCH_HINT = "A scene with events; below the buttons stands what to watch."
 FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the one that it chooses."
 # What *Save session* writes beside the scenarios of a mission with an avoider.
 AVOIDER = '''"""The motion stage of a session: `mrctl run {scenario} --controller motion={avoid}.py:{avoid}`."""
@@ -158,8 +159,7 @@ class Live(Page):
             self._add_run(gui, first)
 
     def _add_drive(self, gui: viser.GuiApi) -> None:
-        self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
-        self._story = gui.add_html("")
+        self.on(gui.add_button_group("Watch", tuple(STORIES), hint=WATCH_HINT), self._tell)
         self._status = gui.add_html("")
         self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
         self.on(self._play, self._command)
@@ -178,6 +178,7 @@ class Live(Page):
         self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
         self.on(self._tree, lambda _: self._show_search())
         self.add_drawing()
+        self._story = gui.add_html("")  # below all buttons, which it would move
         self._timeline = gui.add_html("")
         save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
 
@@ -588,7 +589,7 @@ class Live(Page):
         if self._back is not None:
             doing = f"of {self.session.time:.2f} s; whatever you do goes on from here"
         lap = "" if self._ends is not None else f" · lap {self._lap()}"
-        factor = f" · {self.factor:.2f}× real time" if self.playing else ""
+        factor = f" · {self.factor:.2f}×" if self.playing else ""  # in one line, or it would move the buttons
         lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]
         for row, label in enumerate(self._labels):
             stopped = self._back is None or not np.isfinite(self._record()["x"][row])
