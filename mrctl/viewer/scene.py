@@ -113,7 +113,7 @@ class Scene:
         self.navigation = Navigation(self._scene, robots, footprint, self._height)
         self._grip: viser.MeshHandle | None = None
         self._way: list[viser.MeshHandle] = []  # that a visitor draws: its points and the way
-        self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
+        self._factor = self._scene.add_label("/world/deviation", "", visible=False, anchor="top-center")
         self._ribbons: list[viser.MeshHandle] = []
         self._posts: viser.MeshHandle | None = None
 
@@ -419,7 +419,7 @@ class Scene:
         width = 2 * LINE_WIDTH * self._view
         self._factor.visible = magnified > 1
         if magnified > 1:
-            self._factor.text = f"deviation from the reference × {magnified}"
+            self._factor.text = f"robots: where they are\ntrails and balls: deviation × {magnified}"
         if not self._ribbons:
             self._ribbons = [
                 self._draw_lines(f"/world/trail/{k}", group, width, colours[k]) for k, group in enumerate(groups)
