@@ -19,7 +19,7 @@ from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
 
 FILE = Path(__file__).parent / "images" / "viewer.png"
-SIZE = {"width": 1120, "height": 800}  # px of the page, which a README shows 900 px wide
+WIDTH, HEIGHT = 1120, 800  # px of the page, which a README shows 900 px wide
 PIXELS = 1.5  # of the picture for one of the page
 COLOURS = 255
 # Seconds, groups and names of the buttons that are pressed; the end.
@@ -49,7 +49,7 @@ def main() -> None:
     try:
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=SOFTWARE)
-            page = browser.new_page(viewport=SIZE, device_scale_factor=PIXELS)
+            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, device_scale_factor=PIXELS)
             page.goto(f"http://127.0.0.1:{server.get_port()}")
             page.locator(".mantine-Notification-closeButton").click(timeout=60_000)  # that rendering is in software
             page.get_by_label("Soft light").click()  # which the page of a browser with a GPU switches on by itself

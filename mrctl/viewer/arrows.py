@@ -14,12 +14,13 @@ import viser
 from mrctl.kernel import Array
 from mrctl.physics.contacts import NO_CONTACTS, Contacts
 from mrctl.theory.robot import Robot
-from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour
+from mrctl.viewer.looks import MAX_MARKED, Colour
 from mrctl.viewer.robots import Robots, name_of
 
 PUSH_OF_LENGTH = 3.0  # N/kg, a push whose arrow is as long as the robot
 SLIP_OF_LENGTH = 0.1  # share of the robot's largest speed, a slip whose arrow is as long as the robot
 MIN_ARROW = 0.03  # robot lengths; shorter ones are not drawn
+PUSH_COLOUR: Colour = (217, 119, 6)
 FORCE_COLOUR: Colour = (37, 99, 235)
 SLIP_COLOUR: Colour = (220, 38, 38)
 
@@ -46,7 +47,7 @@ class Arrows:
             return
         way = np.append(self._robots.length * force / (PUSH_OF_LENGTH * self._mass), 0.0)
         if arrow is None:
-            arrow = self._forces[row] = self._draw_arrows(f"/world/force/{row}", EVENT_COLOUR, 0.03)
+            arrow = self._forces[row] = self._draw_arrows(f"/world/force/{row}", PUSH_COLOUR, 0.03)
         arrow.points = np.stack([np.zeros(3), way])[None]
         arrow.position, arrow.visible = self._robots.positions[row] + [0, 0, self._robots.top / 2], True
 

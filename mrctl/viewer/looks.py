@@ -8,7 +8,7 @@ from typing import NamedTuple
 from mrctl.results.controllers import colours_of
 
 Colour = tuple[int, int, int]
-EVENT_COLOUR: Colour = (107, 114, 128)  # grey, which no controller has
+EVENT_COLOUR: Colour = (128, 134, 146)  # grey, which neither PID alone nor a learner has
 MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
 
 
