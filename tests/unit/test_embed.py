@@ -37,7 +37,7 @@ def test_runs(result):
     """Runs of one result, or of several, in one page, which is a single attribute of an iframe."""
     one, two = result.isel(run=0).sel(time=slice(0, 1)), result.isel(run=[1]).sel(time=slice(0, 1))
     replay = mrctl.replay(one, two)
-    assert len(data(replay)["charts"][0]["curves"]) == 5  # two robots and their estimates, the reference
+    assert len(data(replay)["charts"][1]["curves"]) == 5  # of V: two robots and their estimates, the reference
     (inside,) = re.findall(r'srcdoc="([^"]*)"', replay._repr_html_())
     assert html.unescape(inside) == replay.page
 
