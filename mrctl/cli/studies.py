@@ -63,8 +63,9 @@ def suite(
         feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is the best fixed one for each
             run, either model or coefficients fitted to that run afterwards. By default those in the tables of
             RESULTS.md, with --full all.
-        controller: Controllers of your own to compare, such as my_file.py:MyFeedforward, the same behind the nominal
-            model as model+my_file.py:MyFeedforward, or motion=my_file.py:MyMotion.
+        controller: Controllers of your own to compare, such as my_file.py:MyFeedforward, or motion=my_file.py:MyMotion
+            over PID alone. A feedforward of mrctl may stand in front, as in model+my_file.py:MyFeedforward or
+            model+composite+motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
         quick: Run a few cases with few laps, in two minutes; the tables support no claim.

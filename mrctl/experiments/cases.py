@@ -72,7 +72,7 @@ class Case(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What drives the runs: a prior and a learner of mrctl, or a prior and a controller of the user."""
+    """What drives the runs: a prior and a learner of mrctl, and a controller of the user, if any."""
 
     prior: str = "none"
     learner: str = "none"

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from mrctl.experiments import suite
-from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Laps
+from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Choice, Laps
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, interval
 from mrctl.experiments.tables import Table, frame, machine, number, output_folder, write_json
 from mrctl.kernel import Array
@@ -110,8 +110,8 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     if entry in RIVALS or (entry not in FEEDFORWARDS and ".py:" not in entry):
         names = ", ".join(name for name in FEEDFORWARDS if name not in RIVALS)
         raise InputError(
-            f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController, "
-            "with or without model+ in front"
+            f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController, with or without a "
+            "feedforward in front, as in model+my_file.py:MyController"
         )
     if not 1 <= count <= len(HELD_OUT_SEEDS):
         raise InputError(f"seeds: {count} is not between 1 and {len(HELD_OUT_SEEDS):,}")
@@ -123,7 +123,7 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     with output_folder(out):
         fresh = any(suite.left(out / "runs" / one) for one in choices)
         if fresh:
-            _log(out, this | {"replicates": count, "settings": _settings(name) if known else None})
+            _log(out, this | {"replicates": count, "settings": _settings(choices[name])})
         laps, aside = suite.run(chosen, choices, workers, out / "runs")
     rows = compare(name, suite.runs_of(chosen, laps))
     tables = summarised(name, rows, count)
@@ -168,10 +168,11 @@ def _half(cell: Case) -> Case:
     )
 
 
-def _settings(name: str) -> dict[str, Any]:
-    """Returns the settings of a learner that comes with mrctl."""
-    learner = FEEDFORWARDS[name]["learner"]  # type: ignore[index]
-    return getattr(Scenario(), learner).model_dump(mode="json") if learner != "none" else {}
+def _settings(choice: Choice) -> dict[str, Any] | None:
+    """Returns the settings of the learner of mrctl; those of a controller of the user are not known."""
+    if choice.learner == "none":
+        return None if choice.controller else {}
+    return getattr(Scenario(), choice.learner).model_dump(mode="json")
 
 
 def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:

@@ -29,8 +29,8 @@ from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
 from mrctl.scenario import MODEL_BASED, Scenario, feedforward_name
 
-WITHOUT_MAP = ("none", "model", *REFERENCES, *(f"model+{name}" for name in MODEL_BASED))
-"""Feedforwards that learn no map from motion to voltage."""
+WITHOUT_MAP = ("none", *MODEL_BASED)
+"""Learners without a map from motion to voltage."""
 GRID_POINTS = 41  # points along each side of a heat map
 TEMPLATE = Path(__file__).with_name("report.html")
 
@@ -122,12 +122,12 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
 
 
 def with_map(choices: Choices) -> list[str]:
-    """Returns the names of the choices that learn a map: a user's controller does if it has a feedforward."""
-    stages = {name: user_files.split(one.controller) for name, one in choices.items() if one.controller}
+    """Returns the names of the choices that learn a map: a user's feedforward does."""
     return [
         name
-        for name in choices
-        if name not in WITHOUT_MAP and (name not in stages or any(part.stage == "feedforward" for part in stages[name]))
+        for name, one in choices.items()
+        if one.learner not in WITHOUT_MAP
+        or any(part.stage == "feedforward" for part in (user_files.split(one.controller) if one.controller else ()))
     ]
 
 
@@ -202,7 +202,11 @@ def command(outcome: Outcome, choices: Choices) -> str:
 
 def controllers(choices: Choices) -> list[str]:
     """Returns the user's controllers, as on the command line."""
-    return [feedforward_name(one.prior, one.controller) for one in choices.values() if one.controller]
+    return [
+        feedforward_name(feedforward_name(one.prior, one.learner), one.controller)
+        for one in choices.values()
+        if one.controller
+    ]
 
 
 def _worlds(outcome: Outcome) -> int:

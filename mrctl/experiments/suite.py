@@ -110,21 +110,21 @@ def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str]) -> Choice
 
     Args:
         feedforwards: Names of feedforwards of mrctl.
-        controllers: Controllers of the user, each as for `mrctl.loop.user_files`. A feedforward may have `model+` in
-            front, as in `model+my_file.py:MyController`, and then adds to the nominal model.
+        controllers: Controllers of the user, each as for `mrctl.loop.user_files.behind`: with a feedforward of mrctl in
+            front, as in `model+composite+motion=my_file.py:MyMotion`, or without one.
 
     Raises:
         InputError: A controller is bad, or its name is taken.
     """
     choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
     for entry in controllers:
-        prior, stages, parts = user_files.behind(entry)
-        name = feedforward_name(prior, "+".join(part.title for part in parts))
+        front, stages, parts = user_files.behind(entry)
+        name = feedforward_name(front, "+".join(part.title for part in parts))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
         own = user_files.absolute(stages)
-        user_files.trial(own, Scenario(laps=1, prior=prior, learner="none"))
-        choices[name] = Choice(prior, controller=own)
+        user_files.trial(own, Scenario(laps=1, **FEEDFORWARDS[front]))
+        choices[name] = Choice(**FEEDFORWARDS[front], controller=own)
     return choices
 
 

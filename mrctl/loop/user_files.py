@@ -22,9 +22,8 @@ from mrctl.control.stages import METHODS, Stages
 from mrctl.loop.simulation import Simulation
 from mrctl.loop.user_stages import StageError
 from mrctl.record import InputError
-from mrctl.scenario import PriorName, Scenario
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
-MODEL_PREFIX = "model+"  # in front of the name of a feedforward that adds to the nominal model
 NOT_BESIDE = {*sys.stdlib_module_names, "mrctl"}
 """Modules that are not taken from the folder of the file that imports them: in a clone, mrctl stands there too."""
 
@@ -61,8 +60,7 @@ def parts(name: str) -> list[Part]:
     for part in found:
         if not part.path.is_file():
             where = "" if Path(part.file).is_absolute() else f" in {Path.cwd()}"
-            model = "; for the nominal model before it set prior to model" if part.file.startswith(MODEL_PREFIX) else ""
-            raise InputError(f"controller: no file {part.file}{where}{model}")
+            raise InputError(f"controller: no file {part.file}{where}{_remedy(part.file)}")
     return found
 
 
@@ -82,7 +80,7 @@ def split(name: str) -> list[Part]:
             form = "my_file.py:MyController or my_file.py:MyController(gain=0.3)"
             raise InputError(f"controller: {part!r} is not of the form {form}")
         if stage not in METHODS:
-            raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}")
+            raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}{_remedy(stage)}")
         if stage in {known.stage for known in found}:
             raise InputError(f"controller: {stage} is given twice")
         found.append(Part(stage, file, attribute, settings))
@@ -102,22 +100,37 @@ def _called(call: str) -> tuple[str, dict[str, Any]]:
     return "", {}
 
 
-def behind(name: str) -> tuple[PriorName, str, list[Part]]:
-    """Splits a name that may have `model+` in front, as in `model+my_file.py:MyController`.
+def behind(name: str) -> tuple[FeedforwardName, str, list[Part]]:
+    """Splits a name with a feedforward of mrctl in front, as in `model+composite+motion=my_file.py:MyMotion`.
 
     Returns:
-        The prior that the user's feedforward adds to, `none` or `model`; the name without it; and its parts.
+        The feedforward in front, `none` where there is none; the name without it; and its parts.
 
     Raises:
-        InputError: The name is refused, as by `split`, or there is no feedforward that adds to the model.
+        InputError: The name is refused, as by `split`, or a learner is in front of a feedforward of the user.
     """
-    own = name.removeprefix(MODEL_PREFIX)
+    front = _front(name)
+    own = name.removeprefix(f"{front}+")
     found = split(own)
-    if own == name:
-        return "none", own, found
-    if all(part.stage != "feedforward" for part in found):
-        raise InputError(f"controller: {name!r} has {MODEL_PREFIX} in front, but no feedforward that adds to the model")
-    return "model", own, found
+    if FEEDFORWARDS[front]["learner"] != "none" and any(part.stage == "feedforward" for part in found):
+        raise InputError(
+            f"controller: {name!r} has two feedforwards; yours is in the place of a learner, and only model+ can be in "
+            "front of it"
+        )
+    return front, own, found
+
+
+def _front(name: str) -> FeedforwardName:
+    """Returns the feedforward of mrctl that stands in front of a name, `none` where there is none."""
+    fronts: list[FeedforwardName] = [one for one in FEEDFORWARDS if name.startswith(f"{one}+") and one != "none"]
+    return max(fronts, key=len) if fronts else "none"
+
+
+def _remedy(name: str) -> str:
+    """Returns how to drive with the feedforward in front of a name where such a name is not read, or ""."""
+    front = _front(name)
+    fields = [f"{field} to {value}" for field, value in FEEDFORWARDS[front].items() if value != "none"]
+    return f"; for {front} before it set {' and '.join(fields)}" if fields else ""
 
 
 def absolute(name: str) -> str:

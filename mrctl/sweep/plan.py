@@ -64,10 +64,10 @@ class Chosen(NamedTuple):
             raise InputError(f"controller: {value!r} is neither my_file.py:MyController nor {', '.join(FEEDFORWARDS)}")
         from mrctl.loop import user_files  # imported here because it needs the physics, which takes seconds
 
-        prior, own, parts = user_files.behind(value)
-        alone = any(part.stage == "feedforward" for part in parts)
-        fields = {"prior": prior, "learner": "none"} if alone else {}
-        return cls(feedforward_name(prior, "+".join(part.title for part in parts)), own, fields)
+        front, own, parts = user_files.behind(value)
+        says = front != "none" or any(part.stage == "feedforward" for part in parts)
+        title = feedforward_name(front, "+".join(part.title for part in parts))
+        return cls(title, own, FEEDFORWARDS[front] if says else {})
 
 
 class Grid(Record):

@@ -545,7 +545,8 @@ def test_command_line(tmp_path, capsys):
         (f"motion={file}:Other", "controller: mine.py has no Other"),
         ("motion=nowhere.py:Mine", "controller: no file nowhere.py"),
         (f"motion={file}:Mine, motion={file}:Stops", "controller: motion is given twice"),
-        ("model+mine.py:Mine", "; for the nominal model before it set prior to model"),
+        ("model+mine.py:Mine", "; for model before it set prior to model\n"),
+        ("model+fel+motion=mine.py:Mine", "; for model+fel before it set prior to model and learner to fel\n"),
     ):
         assert main([*run, "--controller", name]) == 2
         error = capsys.readouterr().err

@@ -46,8 +46,17 @@ class Gain:
     def learn(self, feedback, frozen, twist, voltage):
         self.ticks += 1
 """
+OPEN = """
+class Open:
+    def __init__(self, robot, size):
+        pass
 
+    def reset(self, pose, reference, period):
+        pass
 
+    def output(self, pose, twist, reference):
+        return reference[:, 3:5]
+"""
 WINDOWS = {"first": lambda e: e[:, 0], "all": lambda e: np.sqrt(np.mean(e**2, axis=1))}
 
 
@@ -469,9 +478,10 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
 def test_maps_are_those_of_feedforwards() -> None:
     """A heat map is drawn of what learns one: not of PID, the model, or a user's controller without a feedforward."""
     own = {"Gain": "/a.py:Gain", "Pursuit": "motion=/a.py:Pursuit", "Both": "motion=/a.py:Pursuit,feedforward=/b.py:B"}
+    learns = {"fel+Pursuit": Choice("none", "fel", own["Pursuit"])}
     choices = suite.by_name(("none", "model", "true_model", "model+l1", "fel", "model+rls", "hindsight"), ())
-    choices = {**choices, **{name: Choice(controller=controller) for name, controller in own.items()}}
-    assert report.with_map(choices) == ["fel", "model+rls", "Gain", "Both"]
+    choices = {**choices, **{name: Choice(controller=controller) for name, controller in own.items()}, **learns}
+    assert report.with_map(choices) == ["fel", "model+rls", "Gain", "Both", "fel+Pursuit"]
 
 
 @pytest.mark.usefixtures("plain", "two_cases")
@@ -492,8 +502,18 @@ def test_controller_with_the_model(tmp_path: Path, capsys: pytest.CaptureFixture
         assert found[name] == pytest.approx(mrctl.summary(runs)["v_rmse"].mean(), rel=1e-12)
     assert found["model+Gain"] != found["Gain"]
     assert f"--controller {file}:Gain model+{file}:Gain" in (out / "report.html").read_text()
-    nothing = refused(capsys, arguments(tmp_path / "no", "--controller", f"model+motion={file}:Gain"))
-    assert "has model+ in front, but no feedforward that adds to the model" in nothing
+    two = refused(capsys, arguments(tmp_path / "no", "--controller", f"model+fel+{file}:Gain"))
+    assert "has two feedforwards; yours is in the place of a learner, and only model+ can be in front of it" in two
+
+
+def test_controller_with_a_learner(tmp_path: Path) -> None:
+    """A motion controller drives over the feedforward in front of it, which its name in tables and on the page says."""
+    file = tmp_path / "mine.py"
+    file.write_text(OPEN)
+    entry = f"model+composite+motion={file}:Open"
+    choices = suite.by_name(("model+composite",), (entry,))
+    assert choices["model+composite+Open"] == Choice("model", "composite", f"motion={file}:Open")
+    assert len(choices) == 2 and report.controllers(choices) == [entry]
 
 
 def test_columns_say_what_they_are(whole: Path) -> None:

@@ -98,7 +98,7 @@ def test_seed_may_be_an_axis():
 
 
 def test_controllers():
-    """A value is a feedforward of mrctl, or a controller of the user; other stages leave prior and learner alone."""
+    """A value is a feedforward of mrctl, a controller of the user, or both; a stage alone leaves prior and learner."""
     values = [
         "none",
         "model+fel",
@@ -106,13 +106,14 @@ def test_controllers():
         "model+a.py:A",
         "motion=b/a.py:B(ahead=0.3)",
         "motion=b/a.py:B,a.py:C",
+        "model+composite+motion=b/a.py:B",
     ]
     laps = {"field": "laps", "values": [1, 2]}
     one = sweep(
         laps, {"field": "controller", "values": values, "paired": True}, runs=2, base={**BASE, "learner": "rls"}
     )
-    own = [None, None, "a.py:A(gain=2)", "a.py:A", *values[4:]]
-    pairs = ["none", "model+fel", "none", "model", "rls", "none"]
+    own = [None, None, "a.py:A(gain=2)", "a.py:A", *values[4:6], "motion=b/a.py:B"]
+    pairs = ["none", "model+fel", "none", "model", "rls", "none", "model+composite"]
     for laps in range(2):
         for place, value in enumerate(values):
             for draw in range(2):
@@ -120,7 +121,7 @@ def test_controllers():
                 assert one.values(run)["controller"] == value
                 assert (one.driven_by(run), one.scenario(run).feedforward) == (own[place], pairs[place])
                 assert one.values(run)["seed"] == one.values(laps * len(values) * 2 + draw)["seed"]
-    titles = ["none", "model+fel", "A(gain=2)", "model+A", "B(ahead=0.3)", "B+C"]
+    titles = ["none", "model+fel", "A(gain=2)", "model+A", "B(ahead=0.3)", "B+C", "model+composite+B"]
     assert [one.axes[1].cell(value) for value in values] == titles
     assert one.drivers == {None: [0, 1, 2, 3]} | {name: [2 * k, 2 * k + 1] for k, name in enumerate(own) if name}
     assert [one.base_of(2 * place).feedforward for place in range(len(values))] == pairs
@@ -257,7 +258,7 @@ def grid(start, stop, count):
             {},
         ),
         ("controller: 'a.py:A.2.' is not of the form", [axis("controller", values=["a.py:A(2)"])], {}),
-        ("controller: .* no feedforward that adds", [axis("controller", values=["model+motion=a.py:A"])], {}),
+        ("controller: .* two feedforwards", [axis("controller", values=["fel+a.py:A,motion=a.py:B"])], {}),
         ("controller: needs values that are names", [axis("controller", values=[1])], {}),
         ("controller: needs values that are names", [axis("controller", uniform=[0, 1])], {}),
         ("scenario: needs values that are tables", [axis("scenario", values=["heavy"])], {}),
