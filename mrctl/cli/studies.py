@@ -62,13 +62,13 @@ def suite(
     Args:
         feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is the best fixed one for each
             run, either model or coefficients fitted to that run afterwards. By default those in the tables of
-            RESULTS.md, with --full all.
+            RESULTS.md, with --full all, with --quick six.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward, or motion=my_file.py:MyMotion
             over PID alone. A feedforward of mrctl may stand in front, as in model+my_file.py:MyFeedforward or
             model+composite+motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
-        quick: Run a few cases with few laps, in two minutes; the tables support no claim.
+        quick: Run a few cases with few laps and feedforwards, in two minutes; the tables support no claim.
         full: Run all cases, in every tier, in hours.
         held_out: Instead, drive this one feedforward, or one of your own as for --controller, through 40 cells that no
             setting was chosen on, beside model, true_model and model+observer.

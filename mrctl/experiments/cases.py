@@ -132,11 +132,13 @@ REPLICATES: dict[Mode, int] = {"quick": 3, "core": 20, "full": 20}
 RANDOM: dict[Mode, int] = {"quick": 6, "core": 30, "full": 1000}
 Entry = FeedforwardName | Literal["hindsight"]
 """A feedforward of mrctl, or the best fixed one for each run."""
+QUICK: tuple[Entry, ...] = ("none", "model", "model+observer", "fel", "model+fel", "model+composite")
+"""What `quick` compares: few, and without `hindsight`, which drives each run three times."""
 
 
 def entries(mode: Mode) -> tuple[Entry, ...]:
     """Returns what the suite compares by default."""
-    return (*(FEEDFORWARDS if mode == "full" else COMPARED), HINDSIGHT)
+    return QUICK if mode == "quick" else (*(FEEDFORWARDS if mode == "full" else COMPARED), HINDSIGHT)
 
 
 PARTS = {

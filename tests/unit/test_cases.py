@@ -5,6 +5,7 @@ import pytest
 
 from mrctl import PERTURBATIONS, Perturbation, Scenario
 from mrctl.experiments import cases
+from mrctl.loop.hindsight import REPETITIONS
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
@@ -46,6 +47,15 @@ def test_complete_and_paired(mode):
     if mode == "core":
         lab = {s.perturbation for case in found if case.part == "steady" for s in case.scenarios}
         assert lab >= {drawn[name] for name in (*cases.UNCERTAIN, "nominal", "all")}
+
+
+def test_quick_takes_two_minutes():
+    """Two cores that each drive 65 s in a second take a minute and a half; starts and tables come on top."""
+    found = cases.cases("quick", cases.REPLICATES["quick"], cases.RANDOM["quick"])
+    runs = [scenario for case in found for scenario in case.scenarios]
+    seconds = sum(s.duration * Scenario().physics_step / s.physics_step for s in runs)
+    drives = sum(1 + REPETITIONS if name == cases.HINDSIGHT else 1 for name in cases.entries("quick"))
+    assert drives * seconds / 65 / 2 < 90
 
 
 def test_steps_are_where_the_laps_say():
