@@ -18,6 +18,12 @@ from mrctl.record import InputError
 
 # samples; with fewer the bootstrap of a mean is too narrow: its 95 % interval of four holds it in 80 %
 MIN_BOOTSTRAP = 10
+TIE = {"v_rmse": 1.64e-4, "omega_rmse": 1.01e-3, "position_rmse": 8.14e-5}
+"""Largest differences of two errors of a run in m/s, rad/s and m that the integrator does not resolve, by metric.
+
+As the `floor` of `superiority` they are the ties of `mrctl suite` (RESULTS.md, "What the integrator resolves"), the
+largest of lap 1, all laps and the last lap. They were measured by halving the step of the default robot at 12 s a lap;
+a robot or course of another kind needs its own."""
 
 
 class Interval(NamedTuple):
@@ -128,7 +134,8 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
         a: One number a run (n,); NaN or infinite where it failed.
         b: The same runs under the other controller (n,).
         level: Confidence level, between 0 and 1.
-        floor: Largest difference that counts as a tie, in the unit of the errors: what the integrator cannot resolve.
+        floor: Largest difference that counts as a tie, in the unit of the errors: what the integrator cannot resolve,
+            such as `TIE["position_rmse"]`. With 0, differences that half the time step reverses count as wins.
 
     Raises:
         InputError: `a` and `b` differ in length, or the level is not between 0 and 1.

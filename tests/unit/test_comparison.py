@@ -1,7 +1,9 @@
 """Statistics against closed forms, published values and values worked out by hand."""
 
+import re
 from itertools import product
 from math import comb
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -183,6 +185,13 @@ def test_floor():
     """Errors that differ by no more than the floor are a tie; one that failed loses at any floor."""
     found = comparison.superiority([1.0, 2.0, 3.0, np.nan, 1.0], [1.05, 1.0, 3.5, 9.0, np.nan], floor=0.1)
     assert (found.wins, found.ties, found.losses) == (2, 1, 2) and found.value == pytest.approx(0.5)
+
+
+def test_ties_are_those_of_the_suite():
+    """`TIE` is what RESULTS.md states, in mm/s, mrad/s and mm."""
+    text = (Path(__file__).parents[2] / "mrctl" / "experiments" / "RESULTS.md").read_text()
+    stated = re.findall(r"a tie in single runs ([\d.]+)\)", text)[:3]
+    assert [f"{1e3 * tie:.3g}" for tie in comparison.TIE.values()] == [f"{float(one):.3g}" for one in stated]
 
 
 def test_quantile_interval():
