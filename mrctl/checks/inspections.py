@@ -365,6 +365,42 @@ def _balance(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     )
 
 
+def _tipping(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    """Compares the acceleration that lifts a caster, or the front wheels, with the largest one that the checks ask for.
+
+    By the moments about the contacts of the driven wheels it bears (m g c − m a h)/(L − t), which is 0 at a = g c/h: a
+    caster ahead lifts where the robot accelerates, one behind where it brakes. The checks accelerate to the limit, and
+    by a fifth of the tyres' grip (`traction`).
+    """
+    lever, base, height = abs(robot.com_offset), abs(robot.wheelbase - robot.trail), robot.com_height
+    hardest = max(robot.max_acceleration, 0.2 * robot.tyre_friction * robot.gravity)
+    needed = hardest * height / robot.gravity
+    if needed <= lever:
+        return None
+    lifting = robot.gravity * lever / height
+    ahead = min(2 * needed, 0.5 * base)  # where that is not enough, also lower
+
+    def move(m: mujoco.MjModel, chassis: Part) -> list[Assignment]:
+        body = m.body(chassis)
+        shift = np.array((np.sign(robot.com_offset) * (ahead - lever), 0, (0.5 * ahead / needed - 1) * height))
+        return [(body.ipos, body.ipos + shift * robot.mass / body.mass[0])]
+
+    moves = "accelerating" if robot.wheelbase > 0 else "braking"
+    front = "front wheels" if is_steered(model) else "caster"
+    load, limit = robot.front_load * robot.mass * robot.gravity, robot.max_acceleration
+    clause = (
+        f"{moves} by more than {lifting:.3g} m/s² lifts the {front}, with {load:.3g} N at rest, {1e3 * base:.3g} mm "
+        f"from the axle, and the centre of mass {1e3 * height:.3g} mm high; "
+    )
+    advice = f"move the centre of mass {1e3 * (needed - lever):.3g} mm towards the {front}"
+    if limit > lifting:
+        clause += f"the limit is {limit:.3g} m/s²"
+        advice += f', or give a limit below {lifting:.3g} m/s² in <numeric name="limits">'
+    else:
+        clause += f"full voltage does so, the limit of {limit:.3g} m/s² does not"
+    return _suspect("tips over", {"chassis": clause}, advice, move)
+
+
 def _wheel_inertia(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     wheels = {wheel: (model.body(wheel), model.geom(wheel).size[0]) for wheel in rolling_wheels(model)}
     ratios = {wheel: body.inertia.max() / (body.mass[0] * radius**2) for wheel, (body, radius) in wheels.items()}
@@ -558,7 +594,7 @@ def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 INSPECTIONS = (
     _edges, _centres, _axles, _places, _heights, _casters, _radii,
     _motors, _armature, _constant, _gear, _grip_of_limits, _drag, _losses, _creep,
-    _balance, _wheel_inertia, _gravity,
+    _balance, _tipping, _wheel_inertia, _gravity,
     _missing_contacts, _other_contacts, _condim, _grip, _short_contacts, _soft_contacts,
     _fork, _servo, _spring, _degrees,
 )  # fmt: skip

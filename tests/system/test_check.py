@@ -180,6 +180,8 @@ KNUCKLE = '<default class="knuckle"><joint'
 ADOPTED = {
     "turtlebot": ('armature="7e-7"', "", "motors", "missing armature"),
     "turtlebot ice": ('friction="0.8"', 'friction="0.04"', "turning_limits", "limits beyond the grip"),
+    "turtlebot tips": ('pos="0.0312 0 0.105"', 'pos="0.002 0 0.105"', "limits", "tips over"),
+    "turtlebot tips at full voltage": ('pos="0.0312 0 0.105"', 'pos="0.01 0 0.105"', "traction", "tips over"),
     "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
     "racecar spring": (KNUCKLE, KNUCKLE + ' stiffness="1"', "circle", "spring at the steering"),
     # Under another name the fork of the default robot is one that is steered by a servo, for which its own is too soft.
@@ -215,6 +217,16 @@ def test_caster_off_the_floor(name, tmp_path, capsys):
     assert main(["check", str(tmp_path / "mine.xml")]) == 1
     out = capsys.readouterr().out
     assert f"- caster off the floor: {says}" in out and "nothing is steered" not in out and "waits for stance: " in out
+
+
+def test_says_how_far_to_move(tmp_path):
+    """Of a caster that lifts: at which acceleration, g c/h, and how far ahead a fifth of the grip does not lift it."""
+    text = (models_folder() / "turtlebot.xml").read_text()
+    (tmp_path / "mine.xml").write_text(text.replace('pos="0.0312 0 0.105"', 'pos="0.002 0 0.105"'))
+    (tips,) = examination(str(tmp_path / "mine.xml")).suspects
+    c, h, hardest = 6.06 * 0.002 / 6.3, 0.035 + 6.06 * 0.105 / 6.3, 0.2 * 0.8 * 9.81
+    assert f"by more than {9.81 * c / h:.3g} m/s² lifts the caster, with {6.3 * 9.81 * c / 0.115:.3g} N" in tips.text
+    assert f"move the centre of mass {1e3 * (hardest * h / 9.81 - c):.3g} mm towards the caster" in tips.text
 
 
 def test_two_faults(robot):
