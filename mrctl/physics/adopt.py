@@ -220,7 +220,10 @@ class _Adoption:
             )
         distances = [(caster.centre - self.origin) @ self.ahead for caster in casters]
         if len(casters) > 2 or min(distances) * max(distances) < 0:
-            raise InputError(f"caster: at most two, both ahead of the axle or both behind, not {_listed(names)}")
+            raise InputError(
+                f"caster: at most two, both ahead of the axle or both behind, not {_listed(names)}; keep those on the "
+                'side of the load, and give the others contype="0" conaffinity="0", as models/turtlebot.xml does'
+            )
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
 
     def _refuse_wheel_that_nothing_turns(self, caster: Wheel) -> None:

@@ -178,6 +178,15 @@ def test_caster_behind(file):
     assert abs(plant.reading["twist"][0, 0]) < 1e-5 and plant.reading["upright"][0] > 0.9999  # stands level
 
 
+def test_casters_ahead_and_behind(file):
+    """They are refused with a remedy, which gives the robot that has the one on the side of its load alone."""
+    other = BALL.format(-0.3).replace("ball", "other")
+    with pytest.raises(InputError, match='both behind, not .* give the others contype="0" conaffinity="0"'):
+        read(file(document(DIFF + other, MOTORS)))
+    mended = read(file(document(DIFF + other.replace("/>", ' contype="0" conaffinity="0"/>'), MOTORS)))[0]
+    assert mended == read(file(document(DIFF, MOTORS)))[0]
+
+
 @pytest.mark.parametrize("body", [CAR, TRICYCLE], ids=["two wheels", "one wheel"])
 def test_steered(file, body):
     """With an electronic differential the robot drives a circle of radius L/tan φ; the inner wheel turns farther."""
