@@ -52,7 +52,7 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
                 such as doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse. Or the
                 folder --out of a mission, which is then driven again and compared with what it holds, bit for bit.
             scenario: The scenario.
-            goal: Drive to this pose, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default to the generator's.
+            goal: Drive to this pose, x and y in m and θ in rad, as in 2,0,0; by default to the generator's.
             start: Start at this pose, written as for --goal; by default at that of the generator, or the origin.
             known: Plan and localise on the map in this file, which may differ from the world and has one of the same
                 formats; by default the map has all that stands still in the world.

@@ -84,8 +84,14 @@ def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json
     outcome, write = str(table["outcome"].iloc[0]), partial(_save, driven, values, out)
     if as_json:
         return Report(json_text(values), outcome, write)
+    # A robot that avoids is not where the plan is in time, to which its position error would be.
+    unsaid = {"position_rmse"} if order.avoid != "none" else set()
     rows = [
-        [robot["label"], robot["outcome"], *(number(scale * robot[name]) for name, (_, scale) in COLUMNS.items())]
+        [
+            robot["label"],
+            robot["outcome"],
+            *("–" if name in unsaid else number(scale * robot[name]) for name, (_, scale) in COLUMNS.items()),
+        ]
         for robot in values["robots"]
     ]
     title = f"plan of {driven.plan.length:.2f} m; number of poses that the search expanded: {driven.plan.expanded:,}"

@@ -153,8 +153,9 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
         A row for each robot: `outcome` (arrived, collided, stuck, out of time, or why it failed), `time` in s, `length`
         of its path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the
         length ℓ of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest
-        `clearance` in m (0 after a collision), `position_rmse` in m, `jerk` in m/s³ (`jerk_of`), `energy` in J, and
-        `expanded`, the number of poses that the search expanded.
+        `clearance` in m (0 after a collision), `position_rmse` in m to the plan in time, which says nothing of a robot
+        that avoids, `jerk` in m/s³ (`jerk_of`), `energy` in J, and `expanded`, the number of poses that the search
+        expanded.
     """
     runs, period, rows = as_runs(result), control_period(result), []
     for row in range(runs.sizes["run"]):
