@@ -14,7 +14,7 @@ from mrctl.control.learners import LEARNERS
 from mrctl.control.weights import arrays_by_name, notes_on, read_arrays, write_arrays
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.results.dataset import scenarios_of
+from mrctl.results.dataset import scenarios_of, written_by
 from mrctl.scenario import Scenario
 
 LAYOUT = "weights_layout"
@@ -41,8 +41,8 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         run: One run of a result, such as `result.isel(run=0)`.
 
     Raises:
-        InputError: There are several runs, the learner keeps nothing, the run failed, what it learned is not finite, or
-            the file cannot be written.
+        InputError: There are several runs, the learner keeps nothing, or kept something else in the version of the
+            result, the run failed, what it learned is not finite, or the file cannot be written.
     """
     if run.sizes.get("run", 1) != 1:
         raise InputError(f"run: {run.sizes['run']} runs; choose one with isel(run=…)")
@@ -57,6 +57,9 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         learner, layout = own["learner"], own["shapes"]
     else:
         learner, layout = scenario.learner, kept(scenario)
+    size, wanted = one.weights.size, sum(int(np.prod(shape)) for shape in layout.values())
+    if size < wanted:  # beside learners that keep more, NaN follow
+        raise InputError(f"learned: {learner} kept {size} numbers in mrctl {written_by(one)}, and keeps {wanted} now")
     arrays = arrays_by_name(one.weights.values, layout)
     for name, array in arrays.items():
         if not np.isfinite(array).all():

@@ -1,5 +1,7 @@
 """What a learner has adapted, kept in a file: the next run starts from it, on another course and frozen or not."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -101,6 +103,10 @@ def test_refused(files, tmp_path):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
     with pytest.raises(InputError, match="^learned: no learner of the run keeps anything"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none"})))
+    older = files["model+rls"][1].isel(weight=slice(80))  # before 0.40.0, without the heading
+    older.attrs["versions"] = json.dumps({"mrctl": "0.39.0"})
+    with pytest.raises(InputError, match=r"^learned: rls kept 80 numbers in mrctl 0\.39\.0, and keeps 120 now$"):
+        mrctl.save_learned(tmp_path / "x", older)
     keeping = {name for name, law in learners.LEARNERS.items() if law.kept(Fel())}
     assert keeping == {"observer", "l1", "fel", "rls", "mrac", "composite"}
 
