@@ -77,6 +77,8 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
     a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across. The driven tyres alone
     accelerate the robot and, where nothing is steered, turn it on the spot: that takes at most half of their grip.
+    An acceleration of g c/h lifts the front wheels or the caster, with the centre of mass c from the axle and h above
+    the floor; at most half of that is asked for.
     """
     grip = robot.tyre_friction * robot.gravity
     speed = 0.64 * robot.velocity_gain * robot.supply
@@ -84,7 +86,8 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     if robot.steering_limit < ANY_ANGLE:
         rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
     stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
-    acceleration = min(stall / 6, 0.2 * grip, 0.5 * grip * (1 - robot.front_load))
+    lifting = robot.gravity * abs(robot.com_offset) / robot.com_height if robot.com_height else math.inf
+    acceleration = min(stall / 6, 0.2 * grip, 0.5 * grip * (1 - robot.front_load), 0.5 * lifting)
     turning = 2 * rotation * acceleration / speed
     if robot.steering_limit >= ANY_ANGLE:
         limited = robot.model_copy(update={"max_rotation": rotation, "max_rotation_acceleration": turning})

@@ -400,6 +400,17 @@ def test_limits(file):
     assert found == pytest.approx((1.5, 3, 1.5, 6), rel=0.2)
 
 
+def test_limits_keep_the_caster_down(file):
+    """With its load nearly over the axle a robot gets half of the acceleration that lifts its caster, and drives."""
+    text = (models_folder() / "turtlebot.xml").read_text()
+    text = re.sub(r'<numeric name="limits"[^>]*>', "", text).replace('pos="0.0312 0 0.105"', 'pos="0.005 0 0.105"')
+    source = file(text)
+    robot, _ = read(source)
+    lifting, course = 9.81 * robot.com_offset / robot.com_height, mrctl.Line(length=1.0, speed=0.3)
+    assert robot.max_acceleration == pytest.approx(lifting / 2) and lifting < 0.1 * robot.tyre_friction * 9.81
+    assert not mrctl.simulate(mrctl.Scenario(robot=source, reference=course, laps=1, learner="none"))["failed"]
+
+
 def test_limits_within_the_grip_of_the_driven_wheels(file):
     """Derived limits ask no more of the driven tyres than their share of the loads that MuJoCo finds at rest."""
     boxes = "<freejoint/>" + BOX.format(0.24).replace('mass="10"', 'mass="60"') + BALL.format(0.3)
