@@ -22,7 +22,14 @@ from mrctl.kernel import Array
 from mrctl.physics.elements import MOTORS, REAR, fronts, knuckles, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import RPM_PER_RAD_S, driven_grip, reaches_limits, sufficient_gears, turning_force
+from mrctl.physics.units import (
+    RPM_PER_RAD_S,
+    driven_grip,
+    lifting_acceleration,
+    reaches_limits,
+    sufficient_gears,
+    turning_force,
+)
 from mrctl.theory.robot import GRAVITY, Robot
 
 Part = Any  # the name of an element of a model, or its index
@@ -368,16 +375,15 @@ def _balance(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 def _tipping(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     """Compares the acceleration that lifts a caster, or the front wheels, with the largest one that the checks ask for.
 
-    By the moments about the contacts of the driven wheels it bears (m g c − m a h)/(L − t), which is 0 at a = g c/h: a
-    caster ahead lifts where the robot accelerates, one behind where it brakes. The checks accelerate to the limit, and
-    by a fifth of the tyres' grip (`traction`).
+    A caster ahead lifts where the robot accelerates, one behind where it brakes (`lifting_acceleration`). The checks
+    accelerate to the limit, and by a fifth of the tyres' grip (`traction`).
     """
     lever, base, height = abs(robot.com_offset), abs(robot.wheelbase - robot.trail), robot.com_height
     hardest = max(robot.max_acceleration, 0.2 * robot.tyre_friction * robot.gravity)
     needed = hardest * height / robot.gravity
     if needed <= lever:
         return None
-    lifting = robot.gravity * lever / height
+    lifting = lifting_acceleration(robot)
     ahead = min(2 * needed, 0.5 * base)  # where that is not enough, also lower
 
     def move(m: mujoco.MjModel, chassis: Part) -> list[Assignment]:

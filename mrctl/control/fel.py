@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import CHANNELS, FEATURES, feature_scale, features
+from mrctl.control.features import CHANNELS, FEATURES, dead_reckoned, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import histories, recall
 from mrctl.control.weights import hidden_units, initial_weights, load_weights, shapes
@@ -232,8 +232,9 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
         if s.norm < s.bound:
             added[0], added[1] = s.output[0] - before, s.output[1] - before_second
     if s.heading_gain > 0:
-        s.heading += shown.period * shown.twist[1]
-        s.x[FEATURES], s.x[FEATURES + 1] = s.heading_gain * np.cos(s.heading), s.heading_gain * np.sin(s.heading)
+        s.heading = dead_reckoned(s.heading, shown.twist[1], shown.period, s.x[FEATURES:])
+        for j in range(FEATURES, INPUTS):
+            s.x[j] *= s.heading_gain
     return s.norm
 
 

@@ -405,7 +405,10 @@ class Plant(ABC):
                 self.stop(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
 
     def stop(self, robot: int, reason: str) -> None:
-        """Stops one robot until it restarts; the first reason counts."""
+        """Stops one robot until it restarts, because it failed for a reason or, with "", because its run has ended.
+
+        Of several calls the first counts.
+        """
         if not self.stopped[robot]:
             self.stopped[robot], self.failure[robot] = True, reason
             self.running -= 1

@@ -77,8 +77,7 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
     a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across. The driven tyres alone
     accelerate the robot and, where nothing is steered, turn it on the spot: that takes at most half of their grip.
-    An acceleration of g c/h lifts the front wheels or the caster, with the centre of mass c from the axle and h above
-    the floor; at most half of that is asked for.
+    At most half of the acceleration that lifts the front wheels or the caster is asked for.
     """
     grip = robot.tyre_friction * robot.gravity
     speed = 0.64 * robot.velocity_gain * robot.supply
@@ -86,14 +85,21 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
     if robot.steering_limit < ANY_ANGLE:
         rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
     stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
-    lifting = robot.gravity * abs(robot.com_offset) / robot.com_height if robot.com_height else math.inf
-    acceleration = min(stall / 6, 0.2 * grip, 0.5 * grip * (1 - robot.front_load), 0.5 * lifting)
+    acceleration = min(stall / 6, 0.2 * grip, 0.5 * grip * (1 - robot.front_load), 0.5 * lifting_acceleration(robot))
     turning = 2 * rotation * acceleration / speed
     if robot.steering_limit >= ANY_ANGLE:
         limited = robot.model_copy(update={"max_rotation": rotation, "max_rotation_acceleration": turning})
         share = min(0.5 * driven_grip(robot) / turning_force(limited), 1.0)
         rotation, turning = rotation * share**0.5, turning * share
     return speed, rotation, acceleration, turning
+
+
+def lifting_acceleration(robot: Robot) -> float:
+    """Returns the acceleration in m/s² that lifts the front wheels or the caster, by statics.
+
+    With the centre of mass c from the axle and h above the floor they bear (m g c − m a h)/base, which is 0 at g c/h.
+    """
+    return robot.gravity * abs(robot.com_offset) / robot.com_height if robot.com_height else math.inf
 
 
 def turning_force(robot: Robot) -> float:

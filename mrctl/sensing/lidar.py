@@ -13,13 +13,14 @@ from mrctl.record import Record, is_whole
 from mrctl.theory.obstacles import Outlines, turned
 from mrctl.theory.rays import cast
 
+MIN_RATE = 1e-3  # Hz, lowest rate of a sensor that is not 0; memory is needed for two periods of the encoders
 FREE_MARGIN = 0.2  # m before what a beam met, up to which there is nothing for sure
 
 
 class Lidar(Record):
     """A planar lidar; the defaults are about the values of an RPLIDAR A1."""
 
-    rate: Annotated[float, Field(ge=1e-3, le=1000)] = 10.0
+    rate: Annotated[float, Field(ge=MIN_RATE, le=1000)] = 10.0
     """Rate of the scans in Hz; all beams of a scan are taken at the same time."""
     beams: Annotated[int, Field(ge=1, le=10_000)] = 360
     """Number of beams of a scan."""

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from mrctl.record import Record, is_whole
 from mrctl.sensing.ekf import MAX_STORED
-from mrctl.sensing.lidar import Lidar
+from mrctl.sensing.lidar import MIN_RATE, Lidar
 from mrctl.theory.drive import (
     NO_LIMIT,
     Backlash,
@@ -81,8 +81,6 @@ LOCALISED: dict[str, dict[str, float]] = {
 }
 """Values that replace the tier's where fixes come from a lidar: about twice the errors that the tests find."""
 
-MIN_RATE = 1e-3
-"""Lowest rate of a sensor in Hz that is not 0; memory is needed for two periods of the encoders."""
 Rate = Annotated[float, Field(ge=0, le=10_000)]
 Latency = Annotated[float, Field(ge=0, le=MAX_DELAY)]
 
