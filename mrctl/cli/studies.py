@@ -62,7 +62,7 @@ def suite(
     Args:
         feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is the best fixed one for each
             run, either model or coefficients fitted to that run afterwards. By default those in the tables of
-            RESULTS.md, with --full all, with --quick six.
+            RESULTS.md, with --full all, with --quick six of them.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward, or motion=my_file.py:MyMotion
             over PID alone. A feedforward of mrctl may stand in front, as in model+my_file.py:MyFeedforward or
             model+composite+motion=my_file.py:MyMotion.
