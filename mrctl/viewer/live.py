@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
-import html
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -17,33 +16,34 @@ from typing_extensions import override
 from viser._messages import HotkeyKey
 
 from mrctl.kernel import Array, Rows
-from mrctl.loop.groups import arranged, suited
+from mrctl.loop.groups import arranged
 from mrctl.loop.timeline import CHANGEABLE, begun, ends, followed, state
 from mrctl.navigation.planning import Avoid
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
 from mrctl.results.controllers import CONTROLLER_FIELDS, title_of
-from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.references import Reference, Waypoints
-from mrctl.theory.robot import Robot, RobotFile
-from mrctl.viewer.arrows import PUSH_OF_LENGTH
-from mrctl.viewer.controls import NEW_RUN_MARK, WORLDS, Controls
+from mrctl.theory.references import Reference
+from mrctl.theory.robot import RobotFile
+from mrctl.viewer.controls import NEW_RUN_MARK, Controls
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import MAX_SECONDS
-from mrctl.viewer.hands import Hands, rounded
+from mrctl.viewer.hands import Hands
 from mrctl.viewer.looks import MAX_MARKED, looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
+from mrctl.viewer.requests import asked, buttons, changed, with_robot
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import MAX_TIME, Session, changed, pushed
+from mrctl.viewer.session import MAX_TIME, Session, pushed
 from mrctl.viewer.stories import STORIES
+from mrctl.viewer.words import gains, timeline
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 200  # about the largest number of samples in a curve; a chart is some 300 pixels wide
@@ -62,10 +62,8 @@ from mrctl.navigation.avoiders import avoiding
 {avoid} = avoiding("{avoid}")
 '''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
-RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 NO_ARCS = np.zeros((0, 2, 2))
 PLANNED_FIELDS = ("world", "steering", "reference")  # fields on which a plan depends
-KEPT_FIELDS = ("prior", "learner", "seed")  # fields that stay when the robot changes, as the tier of the sensors does
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 NEW_RUN_FIELDS = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN_INPUTS = (
@@ -82,25 +80,6 @@ HIDDEN_INPUTS = (
     "control_period",
     "motion_period",
 )
-
-
-def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns the groups of buttons: label, buttons, and the change of the perturbation or the push that each makes.
-
-    Payload and push are in proportion to the robot: the payload is half of its mass.
-    """
-    mass, half_track = robot.mass, robot.half_track
-    load = rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
-    push, spin = rounded(PUSH_OF_LENGTH * mass, 4 * mass * half_track)  # N and N·m
-    return {
-        "Payload": {
-            "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
-            "remove": {"payload": 0.0},
-        },
-        "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
-        "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
-        "Push": {"push": {"push": (0.0, push, 0.0)}, "spin": {"push": (0.0, 0.0, spin)}},
-    }
 
 
 class Live(Page):
@@ -370,24 +349,15 @@ class Live(Page):
                 self._controls.show(self._now())
 
     def _apply(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        name, *rest = path
-        if path == ("perturbation", "control_delay") and np.isfinite(value):  # in whole control periods
-            value = round(value / self.session.period) * self.session.period
+        name = path[0]
         if name in PLANNED_FIELDS and self.session.avoid != "none":
             raise InputError(
                 f"{name}: with --avoid {self.session.avoid} the robots take another goal, but no other {name}"
             )
-        if path == ("reference",):
-            value = {"kind": value}
-        if path == ("sensing", "tier"):  # with all values of the tier
-            path, value = path[:1], {"tier": value}
-        if path == ("pid", "time_constant"):
-            value = value or None  # the input of the design shows 0
-        if name == "sensing":
-            value = _in_periods(path[-1], value, self.session.period)
+        path, value = asked(path, value, self.session.period)
         if name in CHANGEABLE:
             self._go_on()
-            return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
+            return self._apply_event(**{name: changed(self.session.state()[name], path[1:], value)})
         start = self.session.start
         touched = start[:1] if name in CONTROLLER_FIELDS else start
         others = start[len(touched) :]
@@ -425,7 +395,7 @@ class Live(Page):
         if name not in self._robots:
             raise InputError(f"{name}: not one of the choices")
         try:
-            self._begin([_with_robot(s, self._robots[name]) for s in self.session.start])
+            self._begin([with_robot(s, self._robots[name]) for s in self.session.start])
         finally:
             self._robot.value = self.session.start[0].robot.path
 
@@ -636,12 +606,7 @@ class Live(Page):
     def _describe(self) -> None:
         """Writes the timeline, marks the events on the track, and sets the inputs to the present values."""
         scenario = self.session.fullest
-        before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
-        lines = []
-        for event in scenario.schedule:
-            coming = " (to come)" * (event.time > self.time)
-            lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}{coming}")
-            before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
+        lines = timeline(scenario, self.time)
         self._timeline.content = block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"]))
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
@@ -657,37 +622,8 @@ class Live(Page):
             self._scene.robots.show_payload(row, state(saved, self.time)["perturbation"])
         self._controls.designed = self.session.designed()
         self._controls.suit(self.session.robot)
-        present = self._now()
-        self._controls.show(present)
-        self._write_gains(present.steering == "rigid")
-
-    def _write_gains(self, rigid: bool) -> None:
-        """Writes the present gains of the velocity PID, and how often oscillations have slowed the controllers."""
-        units = ("V/(m/s)", "V/m"), RIGID_UNITS if rigid else ("V/(rad/s)", "V/rad")
-        lines = ["<b>Present gains of the velocity PID</b>"]
-        for channel, gains, (k_p, k_i) in zip(("common", "second"), self.session.gains(), units, strict=True):
-            lines.append(f"{channel}: K_p {gains.k_p:.3g} {k_p}, K_i {gains.k_i:.3g} {k_i}")
-        if self.session.oscillations:
-            lines.append(f"oscillations of the PID that slowed the controllers: {self.session.oscillations}")
-        self._gains.content = block("gains", *lines)
-
-
-def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
-    """Returns a value of a field of `Sensing`, a time or a rate rounded to whole control periods of `period` in s."""
-    if isinstance(value, float) and not np.isfinite(value):
-        return value  # which the record refuses
-    if name.endswith("_latency") or name == "delay":
-        return round(value / period) * period
-    if name.endswith("_rate") and value > 0:
-        return 1 / (max(1, round(1 / (value * period))) * period)
-    return value
-
-
-def _with_robot(scenario: Scenario, robot: RobotFile) -> Scenario:
-    """Returns a scenario for another robot: with the same controller, seed and tier, and a reference that suits it."""
-    kept: dict[str, Any] = {name: getattr(scenario, name) for name in KEPT_FIELDS}
-    world = scenario.world if scenario.world in WORLDS else "flat"
-    return suited(Scenario(**kept, world=world, robot=robot, sensing=Sensing(tier=scenario.sensing.tier)))
+        self._controls.show(self._now())
+        self._gains.content = block("gains", *gains(self.session))
 
 
 def _tidy() -> None:
@@ -695,29 +631,3 @@ def _tidy() -> None:
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def _short(value: float | str | None) -> str:
-    """Returns a number or a choice as text."""
-    return "designed" if value is None else value if isinstance(value, str) else f"{value:g}"
-
-
-def _in_words(event: Event, before: dict[str, Any]) -> str:
-    """Returns an event in words."""
-    parts = []
-    for name in CHANGEABLE:
-        if (new := getattr(event, name)) is not None:
-            parts += [
-                f"{field.replace('_', ' ')} {_short(getattr(before[name], field))} → {_short(getattr(new, field))}"
-                for field in type(new).model_fields
-                if getattr(new, field) != getattr(before[name], field)
-            ]
-    if isinstance(event.reference, Waypoints) and not event.reference.closed:
-        parts.append("way to ({:.2f}, {:.2f}) m".format(*event.reference.points[-1]))
-    elif event.reference is not None:
-        parts.append(f"new reference: {event.reference.kind.replace('_', ' ')}")
-    if event.push is not None:
-        parts.append("push {:g} N, {:g} N, {:g} N·m".format(*event.push))
-    if event.learning is not None:
-        parts.append("learning on" if event.learning else "learning off")
-    return ", ".join(parts) or "no change"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import ceil, floor, pi, remainder
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,7 +24,7 @@ from mrctl.navigation.planning import PLAN_MARGIN, REPLAN_MARGIN, Avoid, prepare
 from mrctl.navigation.reactive import Reactive
 from mrctl.physics.contacts import NO_CONTACTS, Contacts
 from mrctl.physics.hull import footprint
-from mrctl.record import InputError, Record
+from mrctl.record import InputError
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
 from mrctl.sensing.prediction import advance
@@ -37,8 +37,6 @@ from mrctl.theory.timing import LIMIT_SHARE, Limits
 MAX_TIME = 3600.0  # s of simulated time after which a session ends
 MIN_PUSH_TIME = 0.5  # s, for which a push is drawn, at least
 SHARED_FIELDS = ("world", "obstacles", "map", "robot", "steering", "control_period", "physics_step")
-
-AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 
 class Session:
@@ -406,18 +404,3 @@ def pushed(scenario: Scenario, time: float) -> Array | None:
         if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, MIN_PUSH_TIME)
     ]
     return np.sum(forces, axis=0) if forces else None
-
-
-def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:
-    """Returns a copy of the record in which the field at a path has another value.
-
-    Raises:
-        InputError: The record refuses the value, or has no such field, as its kind has changed meanwhile.
-    """
-    name, *rest = path
-    if name not in type(record).model_fields:
-        raise InputError(f"{name}: not a field of {type(record).__name__}")
-    if rest:
-        value = changed(getattr(record, name), rest, value)
-    fields = {field: getattr(record, field) for field in type(record).model_fields}
-    return type(record).from_dict(fields | {name: value})

@@ -20,11 +20,12 @@ from mrctl.results.excitation import alone
 from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
-from mrctl.viewer.live import Live, buttons
+from mrctl.viewer.live import Live
 from mrctl.viewer.looks import looks
 from mrctl.viewer.plots import CURSOR_COLOUR
 from mrctl.viewer.recording import Library
 from mrctl.viewer.replay import ReplayPage
+from mrctl.viewer.requests import buttons
 from mrctl.viewer.scatter import DROVE_COLOUR, RING_SIZE
 from mrctl.viewer.server import Server
 
