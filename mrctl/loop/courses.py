@@ -60,6 +60,9 @@ class Courses:
 
         Returns:
             Two arrays with a record of `REFERENCE` of each robot, `(B,)`.
+
+        Raises:
+            ValueError: The run is over at this tick; robots that begin again have no such end.
         """
         if tick != self._tick:
             self._tick, self._now = tick, self._sampled(tick)
@@ -71,6 +74,8 @@ class Courses:
 
     def _sampled(self, tick: int) -> tuple[Rows, Rows]:
         """Returns what `at` returns."""
+        if tick >= self._ticks:
+            raise ValueError(f"step: the run is over after {self._ticks} control periods")
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // SAMPLED_TICKS * SAMPLED_TICKS
             self._block = range(first, min(first + SAMPLED_TICKS, self._ticks))

@@ -197,7 +197,11 @@ class Simulation:
         raise TypeError("simulation: cannot be copied or pickled; another one of its scenarios gives the same bits")
 
     def step(self) -> None:
-        """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
+        """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it.
+
+        Raises:
+            ValueError: All `ticks` are done, and the simulation was not made with `restarting`.
+        """
         try:
             seen, reference = self.sense()
             now, _ = self.courses.at(self.tick)

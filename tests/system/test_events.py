@@ -102,6 +102,18 @@ def test_added_after_sensing():
     assert first_difference(live.result().isel(run=0), again) == again.sizes["time"]
 
 
+def test_step_after_the_end():
+    """A step beyond the last tick is refused with one line, and the result stays as it is."""
+    live = Simulation([BASE.replace(reference=Line(speed=0.5, length=0.025), laps=1)])
+    while live.running:
+        live.step()
+    before = live.result()
+    for _ in range(2):
+        with pytest.raises(ValueError, match="^step: the run is over after 5 control periods$"):
+            live.step()
+    assert live.result().identical(before)
+
+
 @pytest.mark.parametrize("size", [1, 2])
 def test_payload_is_taken_off_again(size):
     """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the prior."""
