@@ -403,7 +403,8 @@ class _Adoption:
     def _align(self) -> None:
         """Moves the chassis' frame to P, with x ahead and z up.
 
-        Wheels then turn forwards, and a fork turns to the left, in the positive direction of their joints.
+        Wheels then turn forwards, and a fork turns to the left, in the positive direction of their joints, a fork from
+        straight on.
         """
         chassis, model = self.spec.body(self.chassis), self.model
         for name in (*self.wheels, *self.steered, *(w.joint for w in self.front if w.joint)):
@@ -412,6 +413,9 @@ class _Adoption:
                 joint.axis = -np.array(joint.axis)
                 joint.range = -np.array(joint.range)[::-1]
                 joint.ref, joint.springref = -joint.ref, -joint.springref
+        for joint in map(self.spec.joint, self.steered):  # straight on is 0, also where the file counts from elsewhere
+            joint.range = np.array(joint.range) - joint.ref
+            joint.ref, joint.springref = 0.0, joint.springref - joint.ref
         for name in self.motors:
             motor = self.spec.actuator(name)
             motor.gear = np.abs(motor.gear)
@@ -492,8 +496,8 @@ class _Adoption:
         kp, kv = (sum(-self.model.actuator_biasprm[k, i] * gears[k] ** 2 for k in servos) for i in (1, 2))
         if not kp > 0:
             raise InputError(f"steering: {_listed(self.steered)} needs a <position> or <pid> actuator with a kp")
-        ranges = [self.model.joint(name).range for name in self.steered]
-        limit = min(float(np.abs(r).min()) for r in ranges)
+        joints = [self.model.joint(name) for name in self.steered]
+        limit = float(min(np.min((j.qpos0 - j.range[0], j.range[1] - j.qpos0)) for j in joints))
         if not 0 < limit < np.pi / 2:
             raise InputError(f"steering: {_listed(self.steered)} needs a range below 90° on either side of straight on")
         anchors = [self._rotation() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]

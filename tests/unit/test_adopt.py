@@ -229,6 +229,18 @@ def test_mirrored_steering(file):
     np.testing.assert_allclose(*poses, atol=1e-9)
 
 
+@pytest.mark.parametrize("body", [CAR, TRICYCLE], ids=["two wheels", "one wheel"])
+def test_steering_that_counts_from_elsewhere(file, body):
+    """A joint that calls straight on 10° is the same one as without: so are the limit and, at 0, the straight path."""
+    servos = SERVO.format("s1") + (SERVO.format("s2") if "s2" in body else "")
+    plain, shifted = (f'range="{r}" stiffness="1"' for r in ("-20 30", '-10 40" ref="10" springref="10'))
+    (robot, model), (same, other) = (
+        read(file(document(body.replace('range="-30 30"', joint), MOTORS + servos))) for joint in (plain, shifted)
+    )
+    assert same == robot and 0 < robot.steering_limit <= np.radians(20)
+    np.testing.assert_array_equal(*(drive(one, robot, (5.0, 5.0), 0.1)["pose"] for one in (model, other)))
+
+
 def test_geared_servo(file):
     """A servo behind a gear is as stiff, and as strong, at the steered joint as in its own file."""
     text = document(TRICYCLE, MOTORS + SERVO.format("s1").replace("/>", ' gear="-3" forcerange="-0.5 0.5"/>'))
@@ -504,6 +516,9 @@ ERRORS = {
         document(DIFF.replace('name="b" axis="0 1 0"', 'name="b" axis="1 1 0"'), MOTORS), {}, ("wheels", "axle")),
     "no servo": (document(TRICYCLE, MOTORS), {"steering": ("s1",)}, ("steering", "'s1'", "kp")),
     "no servo, and no names": (document(TRICYCLE, MOTORS), {}, ("steering", "no trail", '<position joint="s1"')),
+    "range beside straight on": (
+        document(TRICYCLE.replace('"-30', '"10'), MOTORS + SERVO.format("s1")), {}, ("steering", "'s1'", "range"),
+    ),
     "no servos": (document(CAR, MOTORS), {}, ("steering", "no trail", '<position joint="s1"')),
     "no stops": (
         document(TRICYCLE.replace('range="-30 30"', ""), MOTORS + SERVO.format("s1")), {}, ("steering", "range")),
