@@ -66,10 +66,10 @@ def arrays_by_name(flat: Array, layout: Mapping[str, tuple[int, ...]]) -> dict[s
 
 
 def save_weights(path: str | Path, weights: Array) -> None:
-    """Writes flat weights of `fel`, `(n,)`, as a safetensors file.
+    """Writes flat weights of `fel`, `(n,)`, as a safetensors file, whose name must end in `.safetensors`.
 
     Raises:
-        InputError: These are no weights of `fel`, or the file cannot be written.
+        InputError: These are no weights of `fel`, or the file has another suffix or cannot be written.
     """
     flat = np.asarray(weights)
     units, left = hidden_units(flat.size)
@@ -102,8 +102,11 @@ def write_arrays(path: str | Path, arrays: Mapping[str, Array], metadata: dict[s
     """Writes named arrays as a safetensors file, with the version of mrctl and `metadata`.
 
     Raises:
-        InputError: The file cannot be written.
+        InputError: The name does not end in `.safetensors`, by which `read_arrays` knows the format, or the file cannot
+            be written.
     """
+    if Path(path).suffix != ".safetensors":
+        raise InputError(f"{path}: a file of weights must end in .safetensors, or no run could start from it")
     from safetensors.numpy import save
 
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
@@ -131,7 +134,7 @@ def read_arrays(path: str | Path, field: str, expected: Mapping[str, tuple[int, 
     """Reads arrays of these names and shapes, as float64.
 
     Args:
-        path: A safetensors file, or one of `torch.save`.
+        path: A safetensors file, which ends in `.safetensors`, or one of `torch.save`.
         field: Field of the scenario that names the file, for messages.
         expected: Names and shapes.
 

@@ -37,12 +37,12 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
     """Writes what the learner of one run has adapted as a safetensors file, for the field `learned` of a scenario.
 
     Args:
-        path: File to write.
+        path: File to write, whose name ends in `.safetensors`.
         run: One run of a result, such as `result.isel(run=0)`.
 
     Raises:
         InputError: There are several runs, the learner keeps nothing, or kept something else in the version of the
-            result, the run failed, what it learned is not finite, or the file cannot be written.
+            result, the run failed, what it learned is not finite, or the file has another suffix or cannot be written.
     """
     if run.sizes.get("run", 1) != 1:
         raise InputError(f"run: {run.sizes['run']} runs; choose one with isel(run=…)")

@@ -420,9 +420,12 @@ def test_no_code_from_files(tmp_path, writer):
 
 
 def test_save_refused(tmp_path):
-    """A place that cannot be written is named."""
+    """A place that cannot be written is named, and so is a name under which no run could read the weights."""
     with pytest.raises(InputError, match="nowhere.*cannot write weights"):
         save_weights(tmp_path / "nowhere" / "weights.safetensors", trained())
+    with pytest.raises(InputError, match=r"w\.st: a file of weights must end in \.safetensors"):
+        save_weights(tmp_path / "w.st", trained())
+    assert not (tmp_path / "w.st").exists()
 
 
 @pytest.mark.parametrize(
