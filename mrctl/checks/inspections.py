@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mrctl.checks.open_loop import Car, caster_gaps, is_steered, rolling_wheels
 from mrctl.kernel import Array
-from mrctl.physics.elements import MOTORS, REAR, fronts, knuckles, part
+from mrctl.physics.elements import MOTORS, REAR, bodies_of, fronts, knuckles, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import (
@@ -330,6 +330,24 @@ def _drag(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     return Suspect("drag", f"{', '.join(clauses)}; {advice}", repair)
 
 
+def _held_wheels(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    def clauses(wheel: str) -> list[str]:
+        joint = model.joint(wheel)
+        held = [f"a stiffness of {joint.stiffness[0]:g} N·m/rad"] if joint.stiffness.any() else []
+        held += ["a range"] if model.jnt_limited[joint.id] else []
+        torque = model.jnt_actfrcrange[joint.id, 1]
+        return held + ([f"an actuatorfrcrange of {torque:g} N·m"] if model.jnt_actfrclimited[joint.id] else [])
+
+    def free(m: mujoco.MjModel, wheel: Part) -> list[Assignment]:
+        joint = m.joint(wheel)
+        return [(field[joint.id :][:1], 0) for field in (m.jnt_stiffness, m.jnt_limited, m.jnt_actfrclimited)]
+
+    held = {wheel: clauses(wheel) for wheel in rolling_wheels(model)}
+    odd = {wheel: f"joint {wheel} has {' and '.join(found)}" for wheel, found in held.items() if found}
+    advice = "only its motor and its losses turn a wheel in equation (3), so remove it"
+    return _suspect("wheel held by its joint", odd, advice, free)
+
+
 def _losses(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     losses = {wheel: model.joint(wheel).frictionloss[0] for wheel in REAR}
     odd = {w: f"{w} has a frictionloss of {loss:g} N·m" for w, loss in losses.items() if _differ(*losses.values())}
@@ -407,6 +425,21 @@ def _tipping(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     return _suspect("tips over", {"chassis": clause}, advice, move)
 
 
+def _wheel_masses(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    def equalise(m: mujoco.MjModel, quantity: Part) -> Iterable[Assignment]:
+        left, right = (m.body(wheel) for wheel in REAR)
+        return [(getattr(right, name), getattr(left, name)) for name in ("mass", "inertia", "iquat")]
+
+    left, right = (model.body(wheel) for wheel in REAR)
+    values = {
+        "mass": (left.mass[0], right.mass[0], "kg"),
+        "largest inertia": (left.inertia.max(), right.inertia.max(), "kg·m²"),
+    }
+    odd = {name: f"{name} {a:.4g} {unit} left, {b:.4g} right" for name, (a, b, unit) in values.items() if _differ(a, b)}
+    advice = "equation (3) has one wheel for both, so make them equal"
+    return _suspect("left and right wheels differ", odd, advice, equalise)
+
+
 def _wheel_inertia(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     wheels = {wheel: (model.body(wheel), model.geom(wheel).size[0]) for wheel in rolling_wheels(model)}
     ratios = {wheel: body.inertia.max() / (body.mass[0] * radius**2) for wheel, (body, radius) in wheels.items()}
@@ -425,6 +458,13 @@ def _gravity(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     clause = f"it is {_vector(model.opt.gravity)} m/s², not (0, 0, −{GRAVITY})"
     odd = {} if np.allclose(model.opt.gravity, right, atol=1e-3 * GRAVITY) else {"world": clause}
     return _suspect("gravity", odd, "use SI units", lambda m, _: [(m.opt.gravity, right)])
+
+
+def _weightless(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    bodies = [body for body in bodies_of(model) if model.body_gravcomp[body]]
+    odd = {body: f"{model.body(body).name or 'a body'} has gravcomp {model.body_gravcomp[body]:g}" for body in bodies}
+    advice = "a force from outside then carries it, and the wheels bear less than its weight; remove it"
+    return _suspect("weight carried from outside", odd, advice, lambda m, body: [(m.body_gravcomp[body:][:1], 0)])
 
 
 # Contacts
@@ -599,8 +639,8 @@ def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 INSPECTIONS = (
     _edges, _centres, _axles, _places, _heights, _casters, _radii,
-    _motors, _armature, _constant, _gear, _grip_of_limits, _drag, _losses, _creep,
-    _balance, _tipping, _wheel_inertia, _gravity,
+    _motors, _armature, _constant, _gear, _grip_of_limits, _drag, _held_wheels, _losses, _creep,
+    _wheel_masses, _balance, _tipping, _wheel_inertia, _gravity, _weightless,
     _missing_contacts, _other_contacts, _condim, _grip, _short_contacts, _soft_contacts,
     _fork, _servo, _spring, _degrees,
 )  # fmt: skip
