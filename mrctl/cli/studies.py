@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -51,7 +52,7 @@ def suite(
     random: int | None = None,
     quick: bool = False,
     full: bool = False,
-    held_out: str | None = None,
+    held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...")] = None,
     workers: int | None = None,
     out: Path | None = None,
 ) -> None:
@@ -70,8 +71,8 @@ def suite(
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
         quick: Run a few cases with few laps and feedforwards, in two minutes; the tables support no claim.
         full: Run all cases, in every tier, in hours.
-        held_out: Instead, drive this one feedforward, or one of your own as for --controller, through 40 cells that no
-            setting was chosen on, beside model, true_model and model+observer.
+        held_out: Instead, drive these feedforwards, or some of your own as for --controller, through 40 cells that no
+            setting was chosen on, and compare each with model, true_model and model+observer.
         workers: Number of processes on this machine; by default one for each core.
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
             suite_quick, suite_full or held_out.
@@ -85,7 +86,7 @@ def suite(
         raise InputError("quick: give one of --quick, --full and --held-out")
     if held_out is not None:
         if feedforward or controller or random is not None:
-            raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
+            raise InputError("held_out: names the feedforwards to judge; give no others, and no random scenarios")
         return _judge_held_out(held_out, seeds, workers, out or Path("held_out"))
     from mrctl.experiments import suite as uncertainty
     from mrctl.experiments.cases import RANDOM, REPLICATES, Mode, entries
@@ -99,12 +100,12 @@ def suite(
     expect_all(aside)
 
 
-def _judge_held_out(feedforward: str, seeds: int | None, workers: int | None, folder: Path) -> None:
-    """Drives a feedforward through cells that no setting was chosen on: `mrctl suite --held-out FEEDFORWARD`."""
+def _judge_held_out(names: Sequence[str], seeds: int | None, workers: int | None, folder: Path) -> None:
+    """Drives feedforwards through cells that no setting was chosen on: `mrctl suite --held-out NAME ...`."""
     from mrctl.experiments import held_out
     from mrctl.experiments.cases import REPLICATES
 
-    aside = held_out.judge(feedforward, REPLICATES["core"] if seeds is None else seeds, workers, folder)
+    aside = held_out.judge(names, REPLICATES["core"] if seeds is None else seeds, workers, folder)
     print((folder / "table.md").read_text())
     expect_all(aside)
 

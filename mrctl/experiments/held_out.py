@@ -1,8 +1,8 @@
 """The held-out cells: courses and plants on which one learner is judged, and on which nothing is ever chosen.
 
 A setting that was chosen on some runs looks better on them than it is (selection bias). These cells were written down
-before any tuning; their courses, plants and seeds are used nowhere else. A learner is named, with its settings, before
-it is driven through them, and the folder that it is driven into logs each drive, also one that was interrupted.
+before any tuning; their courses, plants and seeds are used nowhere else. Learners are named, with their settings,
+before they drive, and the folder that they are driven into logs each drive, also one that was interrupted.
 """
 
 from __future__ import annotations
@@ -92,11 +92,13 @@ def cells(count: int) -> list[Case]:
     return found
 
 
-def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
-    """Drives one feedforward and its rivals through the cells; writes `table.md` and `table.json`, and logs it.
+def judge(entries: Sequence[str], count: int, workers: int | None, out: Path) -> str:
+    """Drives feedforwards and their rivals through the cells; writes `table.md` and `table.json`, and logs it.
+
+    Each feedforward is compared with the rivals alone, so that the others beside it change nothing.
 
     Args:
-        entry: Name of the feedforward, or one of the user's, as for `suite.by_name`.
+        entries: Names of feedforwards, or of the user's, as for `suite.by_name`.
         count: Number of replicates of each cell.
         workers: Number of processes; by default one for each core.
         out: Folder for the results.
@@ -107,31 +109,39 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     Raises:
         InputError: There is no such feedforward, it is a rival, or the folder cannot be written or holds other runs.
     """
-    if entry in RIVALS or (entry not in FEEDFORWARDS and ".py:" not in entry):
-        names = ", ".join(name for name in FEEDFORWARDS if name not in RIVALS)
-        raise InputError(
-            f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController, with or without a "
-            "feedforward in front, as in model+my_file.py:MyController"
-        )
+    if not entries:
+        raise InputError("held_out: name at least one feedforward")
+    for entry in entries:
+        if entry in RIVALS or (entry not in FEEDFORWARDS and ".py:" not in entry):
+            names = ", ".join(name for name in FEEDFORWARDS if name not in RIVALS)
+            raise InputError(
+                f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController, with or "
+                "without a feedforward in front, as in model+my_file.py:MyController"
+            )
     if not 1 <= count <= len(HELD_OUT_SEEDS):
         raise InputError(f"seeds: {count} is not between 1 and {len(HELD_OUT_SEEDS):,}")
-    known = entry in FEEDFORWARDS
-    choices = suite.by_name((entry, *RIVALS) if known else RIVALS, () if known else (entry,))
-    (name,) = (name for name in choices if name not in RIVALS)
+    known: list[FeedforwardName] = [entry for entry in dict.fromkeys(entries) if entry in FEEDFORWARDS]
+    own = [entry for entry in entries if entry not in FEEDFORWARDS]
+    choices = suite.by_name((*known, *RIVALS), own)
+    judged = dict(zip((name for name in choices if name not in RIVALS), (*known, *own), strict=True))
     chosen = [one for cell in cells(count) for one in (cell, _half(cell))]
-    this = {"entry": entry, "mrctl": versions()["mrctl"]}
+    this = {"mrctl": versions()["mrctl"]}
     with output_folder(out):
-        fresh = any(suite.left(out / "runs" / one) for one in choices)
-        if fresh:
-            _log(out, this | {"replicates": count, "settings": _settings(choices[name])})
+        rivals_left = any(suite.left(out / "runs" / rival) for rival in RIVALS)
+        fresh = [name for name in judged if rivals_left or suite.left(out / "runs" / name)]
+        for name in fresh:
+            _log(out, {"entry": judged[name]} | this | {"replicates": count, "settings": _settings(choices[name])})
         laps, aside = suite.run(chosen, choices, workers, out / "runs")
-    rows = compare(name, suite.runs_of(chosen, laps))
-    tables = summarised(name, rows, count)
-    if fresh or not _said(out, entry):
-        _log(out, this | {"says": tables[0].says})
-    (out / "table.md").write_text("\n".join(table.markdown for table in tables))
+    found, rows, shown = suite.runs_of(chosen, laps), {}, []
+    for name, entry in judged.items():
+        rows[entry] = compare(name, found)
+        tables = summarised(name, rows[entry], count)
+        shown += [table.markdown for table in tables]
+        if name in fresh or not _said(out, entry):
+            _log(out, {"entry": entry} | this | {"says": tables[0].says})
+    (out / "table.md").write_text("\n".join(shown))
     source = {"versions": versions(), "machine": machine()}
-    write_json(out / "table.json", source | {"mode": "held-out", "entry": entry, "cells": rows})
+    write_json(out / "table.json", source | {"mode": "held-out", "cells": rows})
     return aside
 
 
@@ -178,17 +188,20 @@ def _settings(choice: Choice) -> dict[str, Any] | None:
 def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     """Compares a feedforward with each rival in each cell, metric and window: a row for each.
 
+    Of the feedforwards in `found` others than these do not count.
+
     It is at or below a rival if it lost fewer runs; or as many, and its mean over the runs that both finished exceeds
     the rival's by no more than the floor. The floor is that of the course: the largest change of a difference between
     two means, on any of its plants, when the physics step is halved.
     """
     rows = []
+    these = {cell: {one: own[one] for one in (name, *RIVALS)} for cell, own in found.items()}
     for course in courses():
-        whole = {plant: found[f"{course}; {plant}"] for plant in PLANTS}
+        whole = {plant: these[f"{course}; {plant}"] for plant in PLANTS}
         pairs = [
             (
                 {one: laps.isel(run=slice(HALF_STEP_REPLICATES)) for one, laps in own.items()},
-                found[f"{course}; {plant}{HALF}"],
+                these[f"{course}; {plant}{HALF}"],
             )
             for plant, own in whole.items()
         ]
@@ -241,7 +254,7 @@ def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> list[Ta
         f"`model+observer` in so many, in the worst of lap 1, all laps and the last lap: {counted}."
     )
     header = ["error", "window", *(f"at or below {rival}" for rival in RIVALS)]
-    found = [Table("Held-out cells (held-out)", says, frame(cells, header))]
+    found = [Table(f"Held-out cells, {name} (held-out)", says, frame(cells, header))]
     if not all(row["at_or_below"] for row in rows):
         found.append(_above(name, rows))
     return found
@@ -268,4 +281,4 @@ def _above(name: str, rows: Sequence[dict[str, Any]]) -> Table:
         f"In {len(listed)} of {len(rows)} comparisons `{name}` is above the rival: its mean error exceeds that of the "
         "rival by more than the floor, or it has lost more runs. Differences of means with 95 % intervals."
     )
-    return Table("Held-out cells in which it is above a rival (held-out)", says, listed)
+    return Table(f"Held-out cells in which {name} is above a rival (held-out)", says, listed)

@@ -46,8 +46,8 @@ SEARCHED = (
 SOURCES: dict[str, tuple[str, ...]] = {
     "reproduce": ("reproduce --out reproduction",),
     "suite": ("suite --out suite",),
-    "random": ("suite --full --feedforward none fel --seeds 1 --random 1000 --out worlds",),
-    "held_out": ("suite --held-out model+composite --out held_out",),
+    "random": ("suite --full --feedforward none fel true_model model+composite --seeds 4 --random 1000 --out worlds",),
+    "held_out": ("suite --held-out model+composite model+mrac model+rls model+fel --out held_out",),
     "tune": (
         *(f"tune {robot} --delay 0 0.01 0.02 --out tune/{robot}" for robot in ROBOTS),
         "tune --time-constant 0.15 --delay 0 0.02 0.04 --out tune/imc",
@@ -229,12 +229,14 @@ def suite_text(table: Table, everything: str) -> str:
     short = markdown(["case", "feedforward", "failed", *columns], cells)
     by_title = {title: text.partition("\n\n") for title, text in sections(everything).items() if title}
     says = "\n".join(f"- {title}. {says}" for title, (says, _, _) in by_title.items())
-    folded = [
-        f"<details><summary>{title}</summary>\n\n{says}\n\n{text}\n\n</details>"
-        for title, (says, _, text) in by_title.items()
-    ]
+    folded = [_folded(title, f"{says}\n\n{text}") for title, (says, _, text) in by_title.items()]
     title = f"RMSE of the last lap ({table['mode']}), mean [95 % confidence interval]:"
     return "\n\n".join([says, title, short, *folded])
+
+
+def _folded(title: str, text: str) -> str:
+    """Returns text under a title that a reader opens."""
+    return f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"
 
 
 def random_text(everything: str) -> str:
@@ -249,11 +251,15 @@ def held_out_text(table: str, log: str) -> str:
         table: The content of `table.md`.
         log: The content of `held_out.jsonl`.
     """
-    tables = [text for title, text in sections(table).items() if title]
+    tables = {title: text for title, text in sections(table).items() if title}
+    counts = [text for title, text in tables.items() if "above a rival" not in title]
+    folded = [_folded(title, text) for title, text in tables.items() if "above a rival" in title]
     driven = [
         f"- {one['time']}, {one['entry']}, mrctl {one['mrctl']}: {one.get('says') or 'begun'}" for one in logged(log)
     ]
-    return "\n\n".join([*tables, "Drives through the cells that the folder of this one has logged:", "\n".join(driven)])
+    return "\n\n".join(
+        [*counts, *folded, "Drives through the cells that the folder of this one has logged:", "\n".join(driven)]
+    )
 
 
 def tune_text(table: Table) -> str:
@@ -352,9 +358,9 @@ def _random_section(folder: Path) -> str:
 
 
 def _held_out_section(folder: Path) -> str:
-    table = _read(folder / "table.json", "cells", "entry")
+    table = _read(folder / "table.json", "cells", "mode")
     text = held_out_text(_text(folder / "table.md"), _text(folder / LOG_FILE))
-    return _section(f"mrctl suite --held-out {table['entry']}", table, text)
+    return _section(shlex.join(["mrctl", "suite", "--held-out", *table["cells"]]), table, text)
 
 
 def _tune_sections(folders: Sequence[Path]) -> dict[str, str]:

@@ -548,7 +548,8 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert again == [begun, ended | {"time": again[-1]["time"]}]
     assert (begun["entry"], begun["replicates"], ended["says"] in capsys.readouterr().out) == ("none", 2, True)
     table = json.loads((tmp_path / "table.json").read_text())
-    assert table["mode"] == "held-out" and len(table["cells"]) == 2 * 3 * 3 * 3
+    cells = table["cells"]["none"]
+    assert table["mode"] == "held-out" and [*table["cells"]] == ["none"] and len(cells) == 2 * 3 * 3 * 3
     errors = {}
     for name in ("none", "model"):
         for half in (1, 2):
@@ -557,20 +558,26 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
                 runs = mrctl.simulate([s.model_copy(update=changes) for s in cell.scenarios])
                 errors[name, half, cell.name.split("; ")[1]] = mrctl.per_lap(runs).position_rmse.values[:, 0].mean()
     asked = {"metric": "position_rmse", "window": "first", "rival": "model"}
-    for row in (row for row in table["cells"] if asked.items() <= row.items()):
+    for row in (row for row in cells if asked.items() <= row.items()):
         differences = {(half, p): errors["none", half, p] - errors["model", half, p] for half in (1, 2) for p in plants}
         assert row["difference"]["value"] == pytest.approx(differences[1, row["plant"]], rel=1e-9)
         changes = (abs(differences[2, p] - differences[1, p]) for p in plants)
         assert row["floor"]["difference"] >= max(changes) * (1 - 1e-9)
         assert row["at_or_below"] == (differences[1, row["plant"]] <= row["floor"]["difference"])
+    assert cli.main([*words[:3], "rls", *words[3:]]) == 0  # beside another one, and with the runs of before
+    both = json.loads((tmp_path / "table.json").read_text())["cells"]
+    assert both["none"] == cells and len(both["rls"]) == len(cells) and both["rls"] != cells
+    assert [json.loads(line)["entry"] for line in log.read_text().splitlines()] == ["none", "none", "rls", "rls"]
+    assert "Held-out cells, rls" in (tmp_path / "table.md").read_text()
     (tmp_path / "mine.py").write_text(GAIN)
     monkeypatch.setattr(held_out, "PLANTS", {"light": plants["light"]})
     own = [*words[:1], "--held-out", f"model+{tmp_path}/mine.py:Gain", *words[3:-1], str(tmp_path / "own")]
     assert cli.main(own) == 0
     assert "at or below model" in capsys.readouterr().out and (tmp_path / "own" / "runs" / "model+Gain").is_dir()
     assert "is neither one of none, model+indi" in refused(capsys, ["suite", "--held-out", "model"])
+    assert "name at least one" in refused(capsys, ["suite", "--held-out", "--seeds", "2"])
     assert "one of --quick" in refused(capsys, ["suite", "--held-out", "fel", "--quick"])
-    assert "names the one feedforward" in refused(capsys, ["suite", "--held-out", "fel", "--feedforward", "rls"])
+    assert "names the feedforwards to judge" in refused(capsys, ["suite", "--held-out", "fel", "--feedforward", "rls"])
 
 
 @pytest.mark.parametrize(
