@@ -96,6 +96,8 @@ def cast(pose: Array, first: float, step: float, reach: float, outlines: Outline
             area = ax * by - ay * bx  # twice that of the triangle with the sensor; its sign tells the side
             begin = np.arctan2(ay, ax) if area >= 0.0 else np.arctan2(by, bx)
             width = np.arctan2(abs(area), ax * bx + ay * by)
+            if width < EDGE_SLACK:  # seen from its end, where rounding decides; its neighbours are met instead
+                continue
             towards = begin - turn
             towards -= 2 * np.pi * np.floor(towards / (2 * np.pi))
             for lap in range(2):

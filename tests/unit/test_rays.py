@@ -51,6 +51,13 @@ def test_around():
     assert aligned == pytest.approx(2.5 * np.array([1, 2**0.5] * 4))
 
 
+def test_edge_on():
+    """A beam along the line of a side, where rounding tells neither its side nor its distance, meets the next side."""
+    obstacles = Obstacles(shapes=(Box(x=2.0, y=-0.5, length=1.0, width=1.0),))  # one side from (2.5, 0) to (1.5, 0)
+    assert scan(obstacles, (4, 0, np.pi), 2)[1] == pytest.approx(1.5)
+    assert scan(obstacles, (1.5, 2, -np.pi / 2), 2)[1] == pytest.approx(2.0)
+
+
 def test_moving():
     """A beam meets an obstacle where its course has taken it."""
     course = Circle(radius=1.0, period=4.0)
