@@ -13,6 +13,7 @@ from mrctl.theory.clearance import point_to_polygon
 from mrctl.theory.obstacles import Obstacles, Outlines
 
 MAX_CELLS = 20_000_000
+SQUARE_CELLS = 16  # cells along a side of the squares in which a field is measured
 MAP_CELL, MAP_MARGIN = 0.05, 1.0  # m, side of a cell of the field of a map, which extends so far beyond its obstacles
 
 
@@ -147,20 +148,38 @@ def measure_near(outlines: Outlines, reach: float, field: Field) -> None:
 
 @kernel
 def measure(outlines: Outlines, field: Field) -> None:
-    """Writes the distances of `field_of` into the field."""
+    """Writes the distances of `field_of` into the field.
+
+    Only obstacles that may be the nearest one somewhere in a square of cells are held against these cells.
+    """
     discs, edges, first, rings = outlines
     distance, origin, resolution = field
     rows, columns = distance.shape
-    for i in range(rows):
-        for k in range(columns):
-            x, y = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
-            nearest = resolution * np.hypot(rows, columns)
+    least = np.empty(len(discs) + len(rings))  # what each obstacle is away from the middle of a square, at least
+    reach = SQUARE_CELLS / np.sqrt(2.0) * resolution
+    for low in range(0, rows, SQUARE_CELLS):
+        for left in range(0, columns, SQUARE_CELLS):
+            x, y = origin[0] + (left + SQUARE_CELLS / 2) * resolution, origin[1] + (low + SQUARE_CELLS / 2) * resolution
+            away = np.inf
             for n in range(len(discs)):
-                nearest = min(nearest, np.hypot(discs[n, 0] - x, discs[n, 1] - y) - discs[n, 2])
+                least[n] = np.hypot(discs[n, 0] - x, discs[n, 1] - y) - discs[n, 2]
+                away = min(away, least[n])
             for p in range(len(rings)):
-                if np.hypot(rings[p, 0] - x, rings[p, 1] - y) - rings[p, 2] < nearest:
-                    nearest = min(nearest, point_to_polygon(x, y, edges[first[p] : first[p + 1]]))
-            distance[i, k] = nearest
+                least[len(discs) + p] = np.hypot(rings[p, 0] - x, rings[p, 1] - y) - rings[p, 2]
+                if least[len(discs) + p] < away:
+                    away = min(away, point_to_polygon(x, y, edges[first[p] : first[p + 1]]))
+            near = np.flatnonzero(least <= away + 2 * reach)
+            for i in range(low, min(low + SQUARE_CELLS, rows)):
+                for k in range(left, min(left + SQUARE_CELLS, columns)):
+                    x, y = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
+                    nearest = resolution * np.hypot(rows, columns)
+                    for n in near:
+                        p = n - len(discs)
+                        if p < 0:
+                            nearest = min(nearest, np.hypot(discs[n, 0] - x, discs[n, 1] - y) - discs[n, 2])
+                        elif np.hypot(rings[p, 0] - x, rings[p, 1] - y) - rings[p, 2] < nearest:
+                            nearest = min(nearest, point_to_polygon(x, y, edges[first[p] : first[p + 1]]))
+                    distance[i, k] = nearest
 
 
 def _transform(cells: NDArray[np.bool]) -> Array:

@@ -133,6 +133,7 @@ def test_near_field():
     whole = field_of(outlines, low, high, 0.05).distance
     near = near_field(outlines, low, high, 0.05, 0.4).distance
     assert np.array_equal(near, np.minimum(whole, 0.4)) and 0.1 < np.mean(near < 0.4) < 0.99
+    assert np.array_equal(near_field(outlines, low, high, 0.05, 50.0).distance, whole)
 
 
 def test_distance_field():
