@@ -136,6 +136,13 @@ class Axis(Record):
         return {value: Chosen.of(value) for value in self.listed} if self.field == CONTROLLER_FIELD else {}
 
     @property
+    def fields(self) -> list[str]:
+        """Dotted paths of what the axis sets: its field, or the keys of its tables of changes to the scenario."""
+        if self.field == SCENARIO_FIELD:
+            return sorted({key for value in self.listed for key in value})
+        return [self.field]
+
+    @property
     def middle(self) -> float:
         """Mean of a normal distribution, or the middle of the range of another."""
         if self.normal is not None:
@@ -229,7 +236,7 @@ class Sweep(Record):
         return self
 
     def check_draws(self) -> None:
-        """Refuses a seed without effect, and runs that would be exact copies but count as independent ones.
+        """Refuses a seed and values without effect, and runs that are exact copies but would count as independent ones.
 
         This is no part of the validation, because stores of older versions hold such sweeps.
 
@@ -253,6 +260,12 @@ class Sweep(Record):
                     names = ", ".join(self.axes[a].field for a in group)
                     raise InputError(f"{names}: a value is there twice, {printable(key[1:-1])}")
                 seen.add(key)
+        for place, later in enumerate(self.axes):
+            before = [field for axis in self.axes[:place] for field in axis.fields]
+            for field, whole in product(before, later.fields):
+                if f"{field}.".startswith(f"{whole}."):
+                    how = "give it once" if field == whole else f"put the axis {later.field} first"
+                    raise InputError(f"{field}: the axis {later.field} comes later and replaces it; {how}")
 
     def _check_controllers(self) -> None:
         """Refuses an axis of controllers beside something else that says what drives, or with ambiguous names."""

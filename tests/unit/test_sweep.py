@@ -300,10 +300,25 @@ def test_refused(message, axes, changes):
             [axis("laps", values=[1, 1], zip="a"), axis("learner", values=["fel", "fel"], zip="a")],
             {},
         ),
+        (
+            r"perturbation.mass_factor: the axis perturbation comes later and replaces it; put the axis perturbation f",
+            [MASS, axis("perturbation", values=["nominal", "all"])],
+            {},
+        ),
+        (
+            "laps: the axis scenario comes later and replaces it; give it once$",
+            [axis("laps", values=[1, 2]), axis("scenario", values=[{}, {"laps": 4}])],
+            {},
+        ),
+        (
+            "laps: the axis laps comes later",
+            [axis("scenario", values=[{}, {"laps": 4}]), axis("laps", values=[1, 2])],
+            {},
+        ),
     ],
 )
 def test_copies(message, axes, changes):
-    """Runs that are exact copies, and a seed that nobody uses, are refused before a sweep begins."""
+    """Runs that are exact copies, and a seed or values that no run has, are refused before a sweep begins."""
     with pytest.raises(InputError, match=f"^{message}"):
         sweep(*axes, **changes).check_draws()
 
@@ -314,6 +329,7 @@ def test_no_copies():
     zipped = [axis("laps", values=[1, 1, 2], zip="a"), axis("perturbation.slope", values=[0.0, 0.1, 0.0], zip="a")]
     sweep(*zipped, runs=2, seed=3).check_draws()
     Sweep.of([Scenario(seed=seed) for seed in (0, 1, 0)]).check_draws()
+    sweep(axis("scenario", values=[{"laps": 4}, {"perturbation": {"payload": 2.0}}]), MASS).check_draws()
 
 
 def test_many_values_are_checked_fast(capsys, monkeypatch):
