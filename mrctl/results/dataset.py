@@ -266,12 +266,16 @@ def held_scenarios(result: xr.Dataset) -> list[dict[str, Any]]:
     """Returns the fields of the scenarios of the runs in a result, or in a selection of them.
 
     Raises:
-        InputError: A selection of one run has lost its number, so that nothing tells which scenario is its own.
+        InputError: A selection has lost the numbers of its runs, or has other ones, so that nothing tells which
+            scenario is whose.
     """
     every = json.loads(result.attrs["scenarios"])
-    if "run" in result.dims or "run" in result.coords:
-        return [every[run] for run in np.atleast_1d(result["run"])]
-    if len(every) != 1:
+    if "run" in result.coords:
+        numbers = np.atleast_1d(result["run"]).tolist()
+        if foreign := set(numbers) - set(range(len(every))):
+            raise InputError(f"run: {min(foreign)} is the number of none of the {len(every)} scenarios in the result")
+        return [every[run] for run in numbers]
+    if len(every) != result.sizes.get("run", 1):
         raise InputError("run: the selection has lost the number of its run; select it without drop=True")
     return every
 

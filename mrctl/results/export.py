@@ -28,6 +28,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError, reading
 from mrctl.results.dataset import ADDED_SIGNALS, FAULTS, SIGNALS, require, scenarios_of
+from mrctl.results.metrics import as_runs
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import GRAVITY
 
@@ -117,7 +118,13 @@ def export(
     out = Path(out)
     if not {"x", "time"} <= set(result.variables):
         raise InputError("result: holds metrics only; mrctl run STORE --run K --out DIR makes the signals of one run")
-    whole = result if "run" in result.dims else result.expand_dims("run")
+    whole = as_runs(result)
+    numbers, counts = np.unique(whole["run"].values, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(
+            f"run: two runs have the number {numbers[counts > 1][0]}, as after xr.concat; number them anew, as in "
+            f"result.assign_coords(run=range({counts.sum()}))"
+        )
     if run is not None:
         if run not in whole["run"]:
             raise InputError(f"run: the result has no run {run}")

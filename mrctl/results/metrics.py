@@ -71,7 +71,7 @@ def as_runs(result: xr.Dataset) -> xr.Dataset:
     """
     check_kind(result)
     if "run" not in result.dims:
-        single = result.expand_dims("run" if "run" in result.coords else {"run": [0]})
+        single = result.expand_dims("run")  # without a coordinate where the run has lost its number
         result = single.assign_coords(
             {name: ("run", [result[name].item()]) for name in (*PER_RUN, "samples") if name in result.coords}
         )

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+import xarray as xr
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -282,6 +283,18 @@ def test_run_alone(result, path, alone, tmp_path, kind):
     else:
         export(mrctl.open(path), kind, other, 0)
         assert out.read_bytes() == other.read_bytes()
+
+
+def test_run_without_its_number(result, tmp_path):
+    """Its signals are its own; its scenario is not known, so that MCAP is refused, as are two runs of one number."""
+    lost = result.isel(run=1, drop=True)
+    export(lost, "csv", tmp_path / "lost.csv")
+    export(result, "csv", tmp_path / "own.csv", 1)
+    assert (tmp_path / "lost.csv").read_bytes() == (tmp_path / "own.csv").read_bytes()
+    with pytest.raises(InputError, match="^run: the selection has lost the number of its run"):
+        export(lost, "mcap", tmp_path / "lost.mcap")
+    with pytest.raises(InputError, match=r"^run: two runs have the number 0, .*assign_coords\(run=range\(4\)\)$"):
+        export(xr.concat([result, result], "run"), "csv", tmp_path / "twice.csv")
 
 
 @pytest.mark.usefixtures("here")

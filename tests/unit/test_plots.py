@@ -128,6 +128,8 @@ def test_plant_is_named():
     assert plots.compare_errors(result.isel(run=0), result.isel(run=1)).legends[0].get_title().get_text() == both
     with pytest.raises(InputError, match=r"^run: the selection has lost the number of its run; .*$"):
         plots.errors(result.isel(run=1, drop=True))
+    with pytest.raises(InputError, match=r"^run: the selection has lost the number of its run; .*$"):
+        plots.learning_curve(result.isel(run=1, drop=True))
     result.attrs["scenarios"] = json.dumps(kinds[1:])
     alone = plots.errors(result.isel(run=0, drop=True))
     assert alone.legends[0].get_title().get_text() == "plant: b, perturbed, lab"

@@ -18,6 +18,7 @@ from mrctl.loop.runs import simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError
 from mrctl.results.dataset import GAIN_VARIABLES, SIGNALS, open_result, save, scenarios_of, versions
+from mrctl.results.metrics import as_runs
 from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.recording import Library
 
@@ -153,6 +154,12 @@ def test_selection(result):
     assert scenarios_of(result.isel(run=[2, 0])) == [SCENARIOS[2], SCENARIOS[0]]
     assert scenarios_of(result.isel(run=1)) == [SCENARIOS[1]]
     assert scenarios_of(simulate(SCENARIOS[1])) == [SCENARIOS[1]]
+    lost = as_runs(result.isel(run=1, drop=True))
+    assert "run" in lost.dims
+    refused("run: the selection has lost the number of its run; select it without drop=True", scenarios_of, lost)
+    renumbered = result.assign_coords(run=result["run"] + 1)
+    count = len(SCENARIOS)
+    refused(f"run: {count} is the number of none of the {count} scenarios in the result", scenarios_of, renumbered)
 
 
 def test_result_of_an_older_version(result, tmp_path):
