@@ -6,6 +6,7 @@ import base64
 import html
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from mrctl.experiments.suite_tables import NO_CLAIM, times, titled, verdict
 from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
+from mrctl.loop.user_stages import StageError
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
@@ -105,9 +107,9 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
             "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve ends "
             "below 1 by the share of runs that it or PID alone lost.",
         )
-    if learners := with_map(choices):
+    if learned := maps(choices, runs["all"].scenarios[0]):
         drawn["inverse_dynamics"] = (
-            plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
+            plots.inverse_dynamics(learned),
             "Maps that the feedforwards learned with four things wrong at once (all), beside the true inverse dynamics "
             "in steady motion: the common and the differential voltage of the motors over V and θ̇. The line shows "
             "where the robot drove.",
@@ -131,7 +133,16 @@ def with_map(choices: Choices) -> list[str]:
     ]
 
 
-def learned(choice: Choice, scenario: Scenario) -> InverseMap:
+def maps(choices: Choices, scenario: Scenario) -> dict[str, InverseMap]:
+    """Returns what was learned in a scenario, by name; a user's controller that raises an error has no map."""
+    found = {}
+    for name in with_map(choices):
+        with suppress(StageError):
+            found[name] = _map(choices[name], scenario)
+    return found
+
+
+def _map(choice: Choice, scenario: Scenario) -> InverseMap:
     """Drives a scenario again; evaluates the learned feedforward and the true inverse dynamics in steady motion."""
     stages: Stages = user_files.load(choice.controller) if choice.controller else {}
     scenario = scenario.model_copy(update=choice.pair)

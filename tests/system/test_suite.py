@@ -615,6 +615,19 @@ def test_controller_that_fails_later(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run["failure"] == "feedforward Gain: AssertionError: tired (mine.py, line 12), tick 49"
 
 
+def test_controller_without_a_map(tmp_path: Path) -> None:
+    """What raises an error at a command of the heat map, or at every one in the end, costs the others no report."""
+    tired = GAIN.replace("return", "assert self.ticks < 50\n        return")
+    for name, code in (
+        ("tired", tired),
+        ("fast", GAIN.replace("return", "assert command[0, 0] < 1.1\n        return")),
+    ):
+        (tmp_path / f"{name}.py").write_text(code)
+    (tmp_path / "mine.py").write_text(GAIN)
+    choices = {name: Choice(controller=f"{tmp_path / name}.py:Gain") for name in ("tired", "fast", "mine")}
+    assert [*report.maps(choices, mrctl.Scenario(reference=COURSE, laps=1))] == ["mine"]
+
+
 def test_bad_input(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """One line each."""
     out = tmp_path / "suite"
