@@ -11,6 +11,7 @@ and the paragraphs that people wrote about the tables survive.
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -137,7 +138,7 @@ def main(
     page = (sections(_text(out)) if out.exists() else {"": BEGINNING}) | written
     parts = [f"## {title}\n\n{text}" if title else text for title, text in page.items()]
     try:
-        out.write_text("\n\n".join(parts) + "\n")
+        out.write_text(narrow("\n\n".join(parts)) + "\n")
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from None
 
@@ -203,6 +204,20 @@ def sections(page: str) -> dict[str, str]:
     beginning, *others = f"\n{page}".split("\n## ")
     parts = [part.partition("\n") for part in others]
     return {"": beginning.strip()} | {title.strip(): text.strip() for title, _, text in parts}
+
+
+def narrow(page: str) -> str:
+    """Returns Markdown without the padding of its tables, a third of the page; some hosts show only its first 500 KiB.
+
+    Lines that are indented, and blocks of code, stay as they are.
+    """
+    blocks = page.split("```")
+    blocks[::2] = [re.sub(r"^\|.*$", _unpadded, block, flags=re.MULTILINE) for block in blocks[::2]]
+    return "```".join(blocks)
+
+
+def _unpadded(row: re.Match[str]) -> str:
+    return re.sub("-{3,}", "---", re.sub(" +", " ", row[0]))
 
 
 def paper_text(table: Table) -> str:

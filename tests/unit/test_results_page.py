@@ -147,15 +147,15 @@ def test_sections(
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
     short, *folded = page["The uncertainty suite"].split("<details>")
-    assert "| nominal | PID         | 0/2    | 12.3 [12.1, 12.5] |" in short and "slope" not in short
-    assert "| all     | fel         | 2/2    | –  " in short
+    assert "| nominal | PID | 0/2 | 12.3 [12.1, 12.5] |" in short and "slope" not in short
+    assert "| all | fel | 2/2 | – |" in short
     assert (
         "`mrctl suite --full --feedforward none fel --seeds 2 --random 0` made this" in short
         and "- Steady. All tie.\n- A step. `rls` is back." in short
     )
     assert [text.split("</summary>")[0] for text in folded] == ["<summary>Steady", "<summary>A step"]
-    assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
-    assert "| lab     | " in page["The paper"] and "| 1.00         | 0.25 " in page["The paper"]
+    assert "| fel | 3.21 | 3.21 | 3.21 | PID fails |" in page["The paper"]
+    assert "| lab | " in page["The paper"] and "| 1.00 | 0.25 " in page["The paper"]
     assert "2.00 → 1.00" in page["The paper"] and "| an offset | 9.1 %" in page["The paper"]
     safe, pid = page["Where learning is safe"], page["The designed PID"]
     assert safe.startswith("`mrctl tune car --time-constant 0.15 --delay 0.02` made this") and "λ = 0.15 s" in safe
@@ -180,9 +180,9 @@ def test_sections(
     assert "\n\n### Critical width\n\nAll tie." in corridors
     assert "\n\n### Three\n\nNone differs." in page["Three MPPIs"] and "### Up" in page["Feeding up"]
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
-    assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
-    assert "| 0.912 |" in page["Speed"] and "| mppi  | 7.25 " in page["Speed"]
-    assert bench.text(json.loads(figures.read_text())) in page["Speed"]
+    assert "| 21.32 | 21 to 21.64 | 21.28 | +0.19 % |" in page["Identification"]
+    assert "| 0.912 |" in page["Speed"] and "| mppi | 7.25 " in page["Speed"]
+    assert results_page.narrow(bench.text(json.loads(figures.read_text()))) in page["Speed"]
 
 
 def test_everything(
@@ -342,3 +342,13 @@ def test_machine() -> None:
     """The machine has a name and cores."""
     found = machine()
     assert found["processor"] and found["cores"] >= 1
+
+
+def test_narrow() -> None:
+    """Tables lose their padding and nothing else; text, code and what a host shows stay as they are."""
+    page = (
+        "two  spaces\n\n| a    | b -- c |\n| ---- | ------ |\n| 1  2 |    -3  |\n\n```text\n| kept   |\n```\n\n| x  |\n"
+    )
+    table = "| a | b -- c |\n| --- | --- |\n| 1 2 | -3 |"
+    assert results_page.narrow(page) == f"two  spaces\n\n{table}\n\n```text\n| kept   |\n```\n\n| x |\n"
+    assert results_page.narrow(results_page.narrow(page)) == results_page.narrow(page)
