@@ -14,8 +14,9 @@ from mrctl.results.excitation import alone, parameter_error
 from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.looks import Look
+from mrctl.viewer.requests import changed
 from mrctl.viewer.score import Metrics, lessons, one_lap
-from mrctl.viewer.session import Session, changed, pushed
+from mrctl.viewer.session import Session, pushed
 
 BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
 
