@@ -33,7 +33,8 @@ from mrctl.record import InputError, printable, read_file
 from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
-from mrctl.sweep.plan import CONTROLLER_FIELD, Sweep
+from mrctl.sweep.axes import CONTROLLER_FIELD
+from mrctl.sweep.plan import Sweep
 from mrctl.sweep.pool import Cluster, JobOutcome, Pool, Processes, Work, carry_out, check_address
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
