@@ -420,7 +420,6 @@ class Live(Page):
             self._tidied = time.monotonic()
             _tidy()
         self.message = ""
-        self._learning.value = True
         self._show_session()
 
     def _tell_progress(self) -> Callable[[int], None]:
@@ -623,6 +622,7 @@ class Live(Page):
         self._controls.designed = self.session.designed()
         self._controls.suit(self.session.robot)
         self._controls.show(self._now())
+        self._learning.value = self.session.state(self.time)["learning"]
         self._gains.content = block("gains", *gains(self.session))
 
 

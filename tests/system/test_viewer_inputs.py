@@ -434,6 +434,23 @@ def test_looking_back(live):
     assert [e.time for e in live.session.added] == [1.0, 1.2]
 
 
+def test_learning_is_shown(live):
+    """The box says whether the learners learn, whoever switched them off and wherever a visitor looks or goes on."""
+    live._restart([Scenario(events=(Event(time=0.05, learning=False),))])
+    for tick, learning in ((3, True), (7, False), (10, False)):
+        while live.session.tick < tick:
+            live.session.step()
+        live.refresh()
+        assert live._learning.value == learning
+    live._look_back(0.02)
+    assert live._learning.value
+    live._look_back(0.08)
+    live._command("step")
+    assert live.session.tick == 9 and not live._learning.value
+    live._command("reset")
+    assert live._learning.value
+
+
 def test_another_run_begins_empty(live):
     """A reset leaves neither estimates of the run before nor the time to which a visitor went."""
     live._restart([Scenario(sensing={"tier": "field"})])
