@@ -260,7 +260,8 @@ class Live(Page):
         elif name == "step":
             self._go_on()
             self.playing = False
-            self.session.step()
+            if self.session.running:
+                self.session.step()
         elif name == "play":
             self._go_on()
             self.playing = self.session.running

@@ -492,3 +492,6 @@ def test_robot_that_stops(live):
         live.advance(0.1, float("inf"))
     live.refresh()
     assert not live.playing and "stopped:" in live._status.content and "reset" in live._status.content
+    tick = live.session.tick
+    live._command("step")
+    assert live.session.tick == tick  # time is over
