@@ -455,7 +455,8 @@ class Live(Page):
         if self.session.tick < 2:
             raise InputError("download: nothing has happened yet")
         result = self.session.result(max(0, self.session.tick - round(MAX_SECONDS / self.session.period)))
-        return [Recording(result.isel(run=row)) for row in range(self.session.size)]
+        found = [Recording(result.isel(run=row)) for row in range(self.session.size)]
+        return [run for run in found if np.isfinite(run.log["x"][0])]  # the others had stopped before
 
     # -- the loop ----------------------------------------------------------------------------------------------------
 

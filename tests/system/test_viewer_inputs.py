@@ -495,3 +495,15 @@ def test_robot_that_stops(live):
     tick = live.session.tick
     live._command("step")
     assert live.session.tick == tick  # time is over
+
+
+def test_page_without_those_that_have_stopped(live, monkeypatch):
+    """The page of the last minute has no robot that stopped before it, which has no place there."""
+    monkeypatch.setattr(module, "MAX_SECONDS", 0.1)
+    live._restart([Scenario(learner="none", events=(Event(time=0.0, push=(0.0, 5000.0, 0.0)),)), Scenario()])
+    while not live.session.failure(0):
+        live.session.step()
+    assert [run.controller for run in live.shown()] == ["none", "fel"]
+    for _ in range(11):
+        live.session.step()
+    assert [run.controller for run in live.shown()] == ["fel"]
