@@ -201,14 +201,14 @@ def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]
     Raises:
         InputError: Runs differ in world, obstacles, robot or control period, so they cannot share a scene.
     """
-    first = recordings[0]
-    for r in recordings:
-        for field in ("world", "obstacles", "robot", "control_period"):
-            if getattr(r.scenario, field) != getattr(first.scenario, field):
-                raise InputError(f"run: {r.label} drove with another {field} than {first.label}")
     labels = [r.label for r in recordings]
     if len(set(labels)) < len(labels):
         labels = [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
+    first = recordings[0].scenario
+    for r, label in zip(recordings, labels, strict=True):
+        for field in ("world", "obstacles", "robot", "control_period"):
+            if getattr(r.scenario, field) != getattr(first, field):
+                raise InputError(f"run: {label} drove with another {field} than {labels[0]}")
     return looks(labels, [r.controller for r in recordings])
 
 

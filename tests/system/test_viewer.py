@@ -897,6 +897,13 @@ def test_colours_of_a_sweep(tmp_path):
             assert drawn == set(library.table.index[library.table[column] == name])
         own = looks(["a", "b"], ["none", "rls"])
         assert column == "world" or list(colours.values()) == [look.colour for look in own]
+        if column == "world":  # a ghost in another world is refused by its number
+            replay._keep()
+            other = library.table.index[library.table["world"] == "slope"][0]
+            replay.ask(replay._choose, other)
+            replay._run_requests()
+            assert replay.message == f"run: PID alone 0 drove with another world than PID alone {other}"
+            assert replay.runs == [0]
         server.stop()
 
 
