@@ -49,6 +49,7 @@ class Recording:
         start: Time of the first sample since the start of the run in s; all methods count time from this sample.
         log: Record of `TICK` for each sample until the end or the failure, `(T,)`.
         failure: Reason of an early end, or "".
+        end: Time of the failure in s; without one, or where a result does not have it, that of the last sample.
         faults: What `dataset.faults_of` returns.
         clearance: Distance from the nearest obstacle at each sample in m, `(T,)`; None where there are no obstacles.
         parameter_error: Learned less true coefficients of the features at the end of the run in V, `(8, 2)`, as of
@@ -71,6 +72,9 @@ class Recording:
         driven = np.flatnonzero(np.isfinite(log["x"]))
         self.log = log[: 1 + driven[-1]] if driven.size else log[:1]
         self.failure, self.faults = str(run["failure"].values), faults_of(run)
+        there = "failure_time" in run and not run["failure_time"].dims  # to which `where` adds the time
+        failed = float(run["failure_time"]) - self.start if there else np.nan
+        self.end = failed if np.isfinite(failed) else self.duration
         near = bool(self.scenario.obstacles.shapes) and "clearance" in run
         self._scanned = "scanned" in run and run["scanned"].values.item() is True
         self.clearance: Array | None = run["clearance"].values[: len(self.log)] if near else None

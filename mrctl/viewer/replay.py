@@ -192,7 +192,7 @@ class ReplayPage(Page):
         lines = [f"<b>{self.time:.2f} s</b> of {self.duration:.2f} s · {state}"]
         for r in self.recordings:
             if r.failure:
-                lines.append(warning(f"{r.label} stopped after {r.duration:.2f} s: {r.failure}"))
+                lines.append(warning(f"{r.label} stopped after {r.end:.2f} s: {r.failure}"))
             lines += [warning(f"{r.label}: {fault}") for fault in r.faults]
         last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
         bounds = [ends(recording.scenario, recording.start + self.time) for recording in self.recordings]

@@ -648,6 +648,8 @@ def test_replay(browser, tmp_path):
         assert [float(line.split("\t")[1]) for line in lines] == pytest.approx(excited, rel=0.05)
         stated = f"RMS distance to the reference: {1e3 * laps.position_rmse.values[0, 1]:.4g} mm"
         assert stated in page.inner_text("#mrctl-status") and "_" not in page.inner_text("#mrctl-status")
+        stopped = f"stopped after {result.failure_time.values[1]:.2f} s: tilt over 30°"
+        assert stopped in page.inner_text("#mrctl-status")
         pose = f"window.__viserMutable.nodePoseData[{GHOST!r}].wxyz"
         until(lambda: abs(2 * np.arcsin(np.hypot(*page.evaluate(pose)[1:3])) - tilt) < 1e-3, "the ghost to be tipped")
         there = click_on_curve(page, "V, m/s", 0.5)
