@@ -33,7 +33,7 @@ from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import MAX_SECONDS
 from mrctl.viewer.hands import Hands
 from mrctl.viewer.looks import MAX_MARKED, looks
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, not_before_the_start, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
 from mrctl.viewer.requests import asked, buttons, changed, with_robot
@@ -280,9 +280,7 @@ class Live(Page):
 
     def _look_back(self, time: float) -> None:
         """Shows the session at an earlier time in s and pauses; at the present time, or later, shows the present."""
-        if not isinstance(time, int | float) or not np.isfinite(time):
-            raise InputError(f"go to: {time} is not a time")
-        tick = max(0, round(time / self.session.period))
+        tick = round(not_before_the_start(time) / self.session.period)
         self._back = tick if tick < self.session.tick else None
         self._return.visible = self._back is not None
         self._hands.forget()

@@ -338,6 +338,17 @@ def arrivals(labels: Sequence[str], now: Rows, ends: Sequence[Array | None]) -> 
     return lines
 
 
+def not_before_the_start(time: float) -> float:
+    """Returns a time in s to which a visitor goes; a negative one, as a page sends it while somebody types, is 0.
+
+    Raises:
+        InputError: It is not a finite number.
+    """
+    if not isinstance(time, int | float) or not np.isfinite(time):
+        raise InputError(f"go to: {time} is not a time")
+    return max(0.0, time)
+
+
 def warning(text: str) -> str:
     """Returns a text as red HTML."""
     return f'<span style="color:#b91c1c" class="mrctl-error">{html.escape(text)}</span>'

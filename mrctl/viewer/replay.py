@@ -11,7 +11,7 @@ from typing_extensions import override
 from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
 from mrctl.viewer.looks import MAX_MARKED
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, not_before_the_start, warning
 from mrctl.viewer.plots import Plots, references_differ
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import Scatter, meaning, numbers_of
@@ -150,7 +150,7 @@ class ReplayPage(Page):
             self._scrub(0.0, pause=name == "start")
 
     def _scrub(self, time: float, pause: bool = True) -> None:
-        self.time = min(time, self.duration)
+        self.time = min(not_before_the_start(time), self.duration)
         self.playing = self.playing and not pause
         self._drawn = self._plotted = None
 

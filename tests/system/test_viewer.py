@@ -654,6 +654,10 @@ def test_replay(browser, tmp_path):
         until(lambda: abs(2 * np.arcsin(np.hypot(*page.evaluate(pose)[1:3])) - tilt) < 1e-3, "the ghost to be tipped")
         there = click_on_curve(page, "V, m/s", 0.5)
         until(lambda: replay.time == pytest.approx(there, abs=0.02), "it to go to a click on a curve")
+        replay.ask(replay._scrub, float("nan"))
+        until(lambda: replay.message == "go to: nan is not a time" and replay.time, "the time to stay")
+        replay.ask(replay._scrub, -3.0)  # as a page sends it while somebody types
+        until(lambda: replay.time == 0.0, "the beginning")
         replay.ask(replay._choose, 1)
         until(lambda: replay.runs == [1], "the other run, once")
         page.get_by_text("Keep this run as a ghost").click()
