@@ -203,13 +203,16 @@ def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]
     """Returns the look of each run, with its number in the label if labels would be equal.
 
     Raises:
-        InputError: Runs differ in world, obstacles, robot or control period, so they cannot share a scene.
+        InputError: Runs differ in world, obstacles, robot or control period, so they cannot share a scene; or one has
+            no sample, as it had failed before.
     """
     labels = [r.label for r in recordings]
     if len(set(labels)) < len(labels):
         labels = [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
     first = recordings[0].scenario
     for r, label in zip(recordings, labels, strict=True):
+        if not np.isfinite(r.log["x"][0]):
+            raise InputError(f"run: {label} had failed before {r.start:g} s")
         for field in ("world", "obstacles", "robot", "control_period"):
             if getattr(r.scenario, field) != getattr(first, field):
                 raise InputError(f"run: {label} drove with another {field} than {labels[0]}")

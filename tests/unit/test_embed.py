@@ -7,6 +7,7 @@ import re
 import pytest
 
 import mrctl
+from mrctl.viewer.recording import Recording, looks_of
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +52,5 @@ def test_refused(result):
     failed = result.where(result.time < 2)
     with pytest.raises(mrctl.InputError, match="model had failed before 3 s"):
         mrctl.replay(failed.sel(time=slice(3, 4)))
+    with pytest.raises(mrctl.InputError, match="run: PID . model had failed before 3 s"):  # as for `mrctl view`
+        looks_of([Recording(failed.sel(time=slice(3, 4)).isel(run=0))], [0])
