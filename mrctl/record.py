@@ -69,7 +69,8 @@ def read_file(path: str | Path, largest: int = MAX_TEXT_BYTES) -> bytes:
     except InputError:
         raise
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{printable(str(path))}: {reason}") from None  # of a path that is the text of a file, too
 
 
 def printable(text: str) -> str:

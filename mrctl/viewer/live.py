@@ -32,7 +32,7 @@ from mrctl.viewer.controls import NEW_RUN_MARK, Controls
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import MAX_SECONDS
 from mrctl.viewer.hands import Hands
-from mrctl.viewer.looks import MAX_MARKED, looks
+from mrctl.viewer.looks import MAX_MARKED, looks, told_apart
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, not_before_the_start, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
@@ -206,7 +206,7 @@ class Live(Page):
     def _show_session(self) -> None:
         """Shows the robots of a new session in the scene and in the plots."""
         session, first = self.session, self.session.start[0]
-        self._labels = [s.name or title_of(s.feedforward) for s in session.start]
+        self._labels = told_apart([s.name or title_of(s.feedforward) for s in session.start], range(session.size))
         robots = looks(self._labels, [s.feedforward for s in session.start])
         setup = (first.world, first.obstacles, first.robot, first.steering, robots)
         if self._shown_setup != setup:
@@ -443,7 +443,8 @@ class Live(Page):
     def saved(self) -> dict[str, str]:
         """Returns the files that repeat the session, by name: a scenario for each robot, and the avoider, if any."""
         session = self.session
-        files = {f"session-{s.name or s.feedforward}.toml": s.to_toml() for s in session.saved()}
+        names = told_apart([s.name or s.feedforward for s in session.start], range(session.size))
+        files = {f"session-{n}.toml": s.to_toml() for n, s in zip(names, session.saved(), strict=True)}
         if session.avoid != "none":
             files[f"{session.avoid}.py"] = AVOIDER.format(avoid=session.avoid, scenario=next(iter(files)))
         return files

@@ -24,6 +24,13 @@ def looks(labels: Sequence[str], controllers: Sequence[str]) -> list[Look]:
     return [Look(label, _rgb(colour)) for label, colour in zip(labels, colours_of(controllers), strict=True)]
 
 
+def told_apart(names: Sequence[str], numbers: Sequence[int]) -> list[str]:
+    """Returns names, such as labels, each with its number if any two are equal."""
+    if len(set(names)) == len(names):
+        return list(names)
+    return [f"{name} {number}" for name, number in zip(names, numbers, strict=True)]
+
+
 def pale(colour: Colour) -> Colour:
     """Returns the colour of what a robot with a colour estimates or considers."""
     red, green, blue = (255 - (255 - c) // 2 for c in colour)

@@ -31,7 +31,7 @@ from mrctl.theory.obstacles import turned
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference
 from mrctl.viewer.deviation import drawn
-from mrctl.viewer.looks import Look, looks
+from mrctl.viewer.looks import Look, looks, told_apart
 
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
 PATH_HEIGHT = 0.01  # m, height of a path above the ground
@@ -206,9 +206,7 @@ def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]
         InputError: Runs differ in world, obstacles, robot or control period, so they cannot share a scene; or one has
             no sample, as it had failed before.
     """
-    labels = [r.label for r in recordings]
-    if len(set(labels)) < len(labels):
-        labels = [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
+    labels = told_apart([r.label for r in recordings], runs)
     first = recordings[0].scenario
     for r, label in zip(recordings, labels, strict=True):
         if not np.isfinite(r.log["x"][0]):

@@ -3,6 +3,7 @@
 import asyncio
 import re
 import time
+import tomllib
 import typing
 
 import numpy as np
@@ -326,6 +327,15 @@ def test_events_of_the_scenario():
     live.refresh()
     assert box.visible and box.dimensions == pytest.approx((0.2, 0.2, 0.2))
     assert "payload 0 → 8" in live._timeline.content and "to come" not in live._timeline.content
+    server.stop()
+
+
+def test_equal_robots():
+    """Two robots with the same controller, one of which may start from a file, have two names and two saved files."""
+    server = Server(port=0)
+    live = Live([Scenario(seed=1), Scenario(seed=2), Scenario(learner="none")], server)
+    assert len(set(live._labels)) == 3
+    assert [Scenario.from_dict(tomllib.loads(text)).seed for text in live.saved().values()] == [1, 2, 0]
     server.stop()
 
 

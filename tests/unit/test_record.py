@@ -37,6 +37,12 @@ def write(tmp_path, text):
     return path
 
 
+def test_text_in_place_of_a_path():
+    """The text of a file where its path is expected gives one line."""
+    with pytest.raises(InputError, match=r"^[^\n]*name = .*: (File name too long|No such file or directory)$"):
+        Outer.from_toml('name = "y"\n' * 500)
+
+
 @pytest.mark.parametrize(
     ("values", "names"),
     [
