@@ -15,6 +15,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
+from mrctl.viewer.page import failures
 from mrctl.viewer.plots import Chart, charts, legend, references_differ
 from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
@@ -58,9 +59,9 @@ def page(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
         robots: Look of each run.
     """
     times, log, clearance = joint_log(recordings)
-    apart = references_differ(log)
+    apart, failed = references_differ(log), failures([robot.label for robot in robots], recordings)
     parts = {
-        "legend": legend(robots, apart),
+        "legend": legend(robots, apart) + "".join(f"<p>{line}</p>" for line in failed),
         "scene": html.escape(_scene(recordings, robots, magnification(extent(log)))),
         "data": _curves(times, charts(log, robots, recordings[0].period, clearance, apart), event_times(recordings)),
     }

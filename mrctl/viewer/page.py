@@ -338,6 +338,21 @@ def arrivals(labels: Sequence[str], now: Rows, ends: Sequence[Array | None]) -> 
     return lines
 
 
+def failures(labels: Sequence[str], recordings: Sequence[Recording]) -> list[str]:
+    """Returns lines of HTML on the runs that failed, and on what else went wrong in a run.
+
+    Args:
+        labels: Label of each run.
+        recordings: The runs.
+    """
+    lines = []
+    for label, run in zip(labels, recordings, strict=True):
+        if run.failure:
+            lines.append(warning(f"{label} stopped after {run.end:.2f} s: {run.failure}"))
+        lines += [warning(f"{label}: {fault}") for fault in run.faults]
+    return lines
+
+
 def not_before_the_start(time: float) -> float:
     """Returns a time in s to which a visitor goes; a negative one, as a page sends it while somebody types, is 0.
 

@@ -11,7 +11,7 @@ from typing_extensions import override
 from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
 from mrctl.viewer.looks import MAX_MARKED
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, not_before_the_start, warning
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, failures, not_before_the_start
 from mrctl.viewer.plots import Plots, references_differ
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import Scatter, meaning, numbers_of
@@ -190,10 +190,7 @@ class ReplayPage(Page):
     def refresh(self) -> None:
         state = "playing" if self.playing else "paused"
         lines = [f"<b>{self.time:.2f} s</b> of {self.duration:.2f} s · {state}"]
-        for r in self.recordings:
-            if r.failure:
-                lines.append(warning(f"{r.label} stopped after {r.end:.2f} s: {r.failure}"))
-            lines += [warning(f"{r.label}: {fault}") for fault in r.faults]
+        lines += failures(self._labels, self.recordings)
         last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
         bounds = [ends(recording.scenario, recording.start + self.time) for recording in self.recordings]
         lines += arrivals(self._labels, last, bounds)

@@ -43,6 +43,16 @@ def test_runs(result):
     assert html.unescape(inside) == replay.page
 
 
+def test_failure():
+    """The page says which run failed, when and why, and nothing of one that did not."""
+    push = mrctl.Event(time=0.1, push=(0.0, 600.0, 0.0), push_duration=1.0)
+    base = mrctl.Scenario(reference=mrctl.Circle(radius=0.8, period=6.0), laps=1, learner="none")
+    found = mrctl.simulate([base.replace(events=(push,)), base])
+    (said,) = re.findall(r"<p><span[^>]*>(.*?)</span></p>", mrctl.replay(found.sel(time=slice(0.05, 1.5))).page)
+    when = float(found["failure_time"][0]) - 0.05
+    assert said == f"PID alone 0 stopped after {when:.2f} s: {found['failure'][0].item()}"
+
+
 def test_refused(result):
     """No run, too long, a world of its own, or over before it began: one line each."""
     with pytest.raises(mrctl.InputError, match="results: no run"):
