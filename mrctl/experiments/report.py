@@ -107,9 +107,9 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
             "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve ends "
             "below 1 by the share of runs that it or PID alone lost.",
         )
-    if learned := maps(choices, runs["all"].scenarios[0]):
+    if found := maps(choices, runs["all"].scenarios[0]):
         drawn["inverse_dynamics"] = (
-            plots.inverse_dynamics(learned),
+            plots.inverse_dynamics(found),
             "Maps that the feedforwards learned with four things wrong at once (all), beside the true inverse dynamics "
             "in steady motion: the common and the differential voltage of the motors over V and θ̇. The line shows "
             "where the robot drove.",
@@ -138,11 +138,11 @@ def maps(choices: Choices, scenario: Scenario) -> dict[str, InverseMap]:
     found = {}
     for name in with_map(choices):
         with suppress(StageError):
-            found[name] = _map(choices[name], scenario)
+            found[name] = learned(choices[name], scenario)
     return found
 
 
-def _map(choice: Choice, scenario: Scenario) -> InverseMap:
+def learned(choice: Choice, scenario: Scenario) -> InverseMap:
     """Drives a scenario again; evaluates the learned feedforward and the true inverse dynamics in steady motion."""
     stages: Stages = user_files.load(choice.controller) if choice.controller else {}
     scenario = scenario.model_copy(update=choice.pair)

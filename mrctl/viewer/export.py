@@ -15,12 +15,12 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
-from mrctl.viewer.page import failures
 from mrctl.viewer.plots import Chart, charts, legend, references_differ
 from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import PHONE, Server
+from mrctl.viewer.words import failures
 
 PICTURE_RATE = 25  # pictures for each second of the replay
 SAMPLES = 1200  # about the largest number of samples in a curve

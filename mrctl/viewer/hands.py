@@ -13,9 +13,10 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Pose
 from mrctl.viewer.arrows import PUSH_OF_LENGTH
-from mrctl.viewer.page import Page, block
+from mrctl.viewer.page import Page
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.session import Session
+from mrctl.viewer.words import block
 
 GOAL_HINT = "Drag on the floor from where the robots shall go to where they shall look there; or click twice."
 WAY_HINT = "Click on the floor to draw a new reference from where the first robot is; the session pauses."

@@ -33,7 +33,7 @@ from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import MAX_SECONDS
 from mrctl.viewer.hands import Hands
 from mrctl.viewer.looks import MAX_MARKED, looks, told_apart
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, not_before_the_start, warning
+from mrctl.viewer.page import SPEEDS, Page, not_before_the_start
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
 from mrctl.viewer.requests import asked, buttons, changed, with_robot
@@ -43,7 +43,7 @@ from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import MAX_TIME, Session, pushed
 from mrctl.viewer.stories import STORIES
-from mrctl.viewer.words import gains, timeline
+from mrctl.viewer.words import arrivals, block, gains, timeline, warning
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 200  # about the largest number of samples in a curve; a chart is some 300 pixels wide

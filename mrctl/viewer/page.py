@@ -17,14 +17,14 @@ import numpy as np
 import viser
 from viser._messages import HotkeyKey
 
-from mrctl.kernel import Array, Rows
-from mrctl.loop.goals import arrived
+from mrctl.kernel import Rows
 from mrctl.record import InputError
 from mrctl.viewer import deviation, sensors
 from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.recording import Recording, looks_of
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.server import MANNERS, PHONE, SOFT_LIGHT, Server
+from mrctl.viewer.words import block, warning
 
 FRAME, REFRESH = 1 / 25, 1 / 12  # s of wall time between two pictures, and between two updates of the plots
 CURVES_WIDTH, INPUTS_WIDTH = 340.0, 290.0  # px of the panels, of which 1280 px leave half to the scene
@@ -323,36 +323,6 @@ class Page(ABC):
             self._report_errors(request)
 
 
-def arrivals(labels: Sequence[str], now: Rows, ends: Sequence[Array | None]) -> list[str]:
-    """Returns a line of HTML for each robot that stands at the goal.
-
-    Args:
-        labels: Label of each robot.
-        now: Record of `TICK` of each robot, `(B,)`.
-        ends: Start and goal of each robot, poses in m, m, rad, `(2, 3)`, or None.
-    """
-    lines = []
-    for label, row, bounds in zip(labels, now, ends, strict=True):
-        if bounds is not None and arrived(np.array([row["x"], row["y"], row["theta"]]), row["v"], bounds[1]):
-            lines.append(f"{html.escape(label)} has arrived")
-    return lines
-
-
-def failures(labels: Sequence[str], recordings: Sequence[Recording]) -> list[str]:
-    """Returns lines of HTML on the runs that failed, and on what else went wrong in a run.
-
-    Args:
-        labels: Label of each run.
-        recordings: The runs.
-    """
-    lines = []
-    for label, run in zip(labels, recordings, strict=True):
-        if run.failure:
-            lines.append(warning(f"{label} stopped after {run.end:.2f} s: {run.failure}"))
-        lines += [warning(f"{label}: {fault}") for fault in run.faults]
-    return lines
-
-
 def not_before_the_start(time: float) -> float:
     """Returns a time in s to which a visitor goes; a negative one, as a page sends it while somebody types, is 0.
 
@@ -362,13 +332,3 @@ def not_before_the_start(time: float) -> float:
     if not isinstance(time, int | float) or not np.isfinite(time):
         raise InputError(f"go to: {time} is not a time")
     return max(0.0, time)
-
-
-def warning(text: str) -> str:
-    """Returns a text as red HTML."""
-    return f'<span style="color:#b91c1c" class="mrctl-error">{html.escape(text)}</span>'
-
-
-def block(name: str, *lines: str) -> str:
-    """Returns lines as an HTML block with the id `mrctl-NAME`."""
-    return f'<div style="margin:0.4em 1em;max-height:14em;overflow:auto" id="mrctl-{name}">{"<br>".join(lines)}</div>'

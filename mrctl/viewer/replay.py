@@ -11,7 +11,7 @@ from typing_extensions import override
 from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
 from mrctl.viewer.looks import MAX_MARKED
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, failures, not_before_the_start
+from mrctl.viewer.page import SPEEDS, Page, not_before_the_start
 from mrctl.viewer.plots import Plots, references_differ
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import Scatter, meaning, numbers_of
@@ -19,6 +19,7 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
+from mrctl.viewer.words import arrivals, block, failures
 
 SAMPLES = 800  # about the largest number of samples in a curve
 

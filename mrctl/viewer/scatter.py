@@ -16,8 +16,8 @@ from mrctl.record import InputError
 from mrctl.results.controllers import CONTROLLER_FIELDS, title_of
 from mrctl.results.metrics import METRICS, shown_unit
 from mrctl.viewer.looks import Colour, looks
-from mrctl.viewer.page import block
 from mrctl.viewer.plots import CURSOR_COLOUR
+from mrctl.viewer.words import block
 
 DROVE_COLOUR, FAILED_COLOUR = (71, 85, 105), (185, 28, 28)
 DOT_SIZE, RING_SIZE = 9.0, 20.0  # pixels, diameters of the dot of a run and of the ring around the one that is shown

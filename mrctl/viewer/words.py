@@ -1,13 +1,19 @@
-"""What a live session says in words: its events, and the gains of its velocity controller."""
+"""What pages say in words, as lines of HTML: events, gains, arrivals, failures, errors."""
 
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from mrctl.kernel import Array, Rows
+from mrctl.loop.goals import arrived
 from mrctl.loop.timeline import CHANGEABLE
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.references import Waypoints
+from mrctl.viewer.recording import Recording
 from mrctl.viewer.session import Session
 
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
@@ -60,3 +66,43 @@ def gains(session: Session) -> list[str]:
     if session.oscillations:
         lines.append(f"oscillations of the PID that slowed the controllers: {session.oscillations}")
     return lines
+
+
+def arrivals(labels: Sequence[str], now: Rows, ends: Sequence[Array | None]) -> list[str]:
+    """Returns a line of HTML for each robot that stands at the goal.
+
+    Args:
+        labels: Label of each robot.
+        now: Record of `TICK` of each robot, `(B,)`.
+        ends: Start and goal of each robot, poses in m, m, rad, `(2, 3)`, or None.
+    """
+    lines = []
+    for label, row, bounds in zip(labels, now, ends, strict=True):
+        if bounds is not None and arrived(np.array([row["x"], row["y"], row["theta"]]), row["v"], bounds[1]):
+            lines.append(f"{html.escape(label)} has arrived")
+    return lines
+
+
+def failures(labels: Sequence[str], recordings: Sequence[Recording]) -> list[str]:
+    """Returns lines of HTML on the runs that failed, and on what else went wrong in a run.
+
+    Args:
+        labels: Label of each run.
+        recordings: The runs.
+    """
+    lines = []
+    for label, run in zip(labels, recordings, strict=True):
+        if run.failure:
+            lines.append(warning(f"{label} stopped after {run.end:.2f} s: {run.failure}"))
+        lines += [warning(f"{label}: {fault}") for fault in run.faults]
+    return lines
+
+
+def warning(text: str) -> str:
+    """Returns a text as red HTML."""
+    return f'<span style="color:#b91c1c" class="mrctl-error">{html.escape(text)}</span>'
+
+
+def block(name: str, *lines: str) -> str:
+    """Returns lines as an HTML block with the id `mrctl-NAME`."""
+    return f'<div style="margin:0.4em 1em;max-height:14em;overflow:auto" id="mrctl-{name}">{"<br>".join(lines)}</div>'

@@ -30,12 +30,12 @@ from mrctl.viewer import view as viewing
 from mrctl.viewer.cameras import FILLED_SHARE
 from mrctl.viewer.export import _curves
 from mrctl.viewer.live import SAMPLES, WINDOW, Live
-from mrctl.viewer.page import arrivals
 from mrctl.viewer.plots import charts
 from mrctl.viewer.recording import Library, joint_log, looks_of
 from mrctl.viewer.replay import ReplayPage
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import Session
+from mrctl.viewer.words import arrivals
 
 TURNING = Box(x=0.1, y=3.0, length=0.3, width=0.2, course=Circle(radius=0.5, period=6.0))
 PASSING = Disc(y=-2.0, radius=0.2, course=Line(speed=0.5, length=4.0))
