@@ -165,15 +165,6 @@ def drive(model, robot, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
     return plant.reading[0].copy()
 
 
-@pytest.mark.filterwarnings("error")
-def test_options_stay_behind(file):
-    """Gravity and integrator of the robot's file do not count beside those of the world, and nothing warns of that."""
-    option = '<option timestep="0.0005" integrator="RK4" gravity="0 0 -1.6"/>'
-    (robot, model), (own, plain) = (read(file(document(DIFF, MOTORS, extra=extra))) for extra in (option, ""))
-    assert robot == own and model.opt.integrator == plain.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
-    assert np.array_equal(model.opt.gravity, plain.opt.gravity) and model.opt.timestep == plain.opt.timestep
-
-
 def test_caster_behind(file):
     """A caster behind the axle has a negative wheelbase, with the centre of mass on its side."""
     body = DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"').replace('pos="0.3 0 -0.06"', 'pos="-0.3 0 -0.06"')
