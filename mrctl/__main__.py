@@ -11,6 +11,7 @@ import gc
 import os
 import signal
 import sys
+from subprocess import Popen
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -32,10 +33,14 @@ class _Interrupts:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Ends the program at once if it is importing a module, and otherwise lets the command tidy up and end it."""
         self.caught = True
+        begun = list[Popen[str]]()
         while frame:
+            begun += [value for value in frame.f_locals.values() if isinstance(value, Popen)]
             if frame.f_code.co_filename.startswith("<frozen importlib"):
                 with contextlib.suppress(OSError):
                     sys.stdout.flush()
+                for program in begun:  # such as the one that glfw asks for a version, which would print a traceback
+                    program.kill()
                 print("mrctl: interrupted", file=sys.__stderr__, flush=True)  # sys.stderr may be captured just now
                 os._exit(130)
             frame = frame.f_back

@@ -419,6 +419,33 @@ def test_interrupt_of_a_program(wait: float) -> None:
     assert "Traceback" not in said
 
 
+ASKS = """
+import os, signal, sys, time
+from subprocess import PIPE, Popen
+
+ASKED = "import os, signal, time; input(); os.kill(os.getppid(), signal.SIGINT); time.sleep(0.3); print(3)"
+
+def version():
+    process = Popen([sys.executable, "-c", ASKED], stdin=PIPE, stdout=PIPE, text=True)
+    return process.communicate("name")
+
+version()
+"""
+
+
+def test_interrupt_of_a_program_that_an_import_began(tmp_path: Path) -> None:
+    """Ctrl-C while a library that is being imported asks a program of its own, as glfw does, gives one line too."""
+    (tmp_path / "asks.py").write_text(ASKS)
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys, types\n"
+        "sys.modules['mrctl.cli'] = cli = types.ModuleType('mrctl.cli')\n"
+        "cli.main = lambda: __import__('asks')\n"
+    )
+    command, paths = [sys.executable, "-m", "mrctl"], os.environ | {"PYTHONPATH": str(tmp_path)}
+    ended = subprocess.run(command, env=paths, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (130, "mrctl: interrupted\n")
+
+
 CALLED_BACK = """
 import ctypes, os, signal, sys, time, types
 
