@@ -55,11 +55,14 @@ def asked(options: dict[str, Any] | None) -> Any:  # noqa: ANN401
     """Returns the perturbation in the options of a reset, or None.
 
     Raises:
-        InputError: There is another option.
+        InputError: The options are no dictionary, or there is another one.
     """
-    for name in (options or {}).keys() - {"perturbation"}:
+    options = {} if options is None else options
+    if not isinstance(options, dict):
+        raise InputError("options: must be a dictionary, such as {'perturbation': 'all'}")
+    for name in options.keys() - {"perturbation"}:
         raise InputError(f"options: there is no {name!r}, only perturbation")
-    return (options or {}).get("perturbation")
+    return options.get("perturbation")
 
 
 class TrackingEnv(gymnasium.Env):

@@ -266,18 +266,30 @@ def held_scenarios(result: xr.Dataset) -> list[dict[str, Any]]:
     """Returns the fields of the scenarios of the runs in a result, or in a selection of them.
 
     Raises:
-        InputError: A selection has lost the numbers of its runs, or has other ones, so that nothing tells which
-            scenario is whose.
+        InputError: A selection has lost the numbers of its runs, or has other ones, or two runs have one number, so
+            that nothing tells which scenario is whose.
     """
     every = json.loads(result.attrs["scenarios"])
     if "run" in result.coords:
         numbers = np.atleast_1d(result["run"]).tolist()
         if foreign := set(numbers) - set(range(len(every))):
             raise InputError(f"run: {min(foreign)} is the number of none of the {len(every)} scenarios in the result")
+        places = dict[int, int]()
+        for place, run in enumerate(numbers):
+            if (first := places.setdefault(run, place)) < place and not _same(result, first, place):
+                raise InputError(
+                    f"run: {run} is the number of two different runs, as after xr.concat, which keeps the scenarios of "
+                    "one result alone; simulate drives all scenarios in one call"
+                )
         return [every[run] for run in numbers]
     if len(every) != result.sizes.get("run", 1):
         raise InputError("run: the selection has lost the number of its run; select it without drop=True")
     return every
+
+
+def _same(result: xr.Dataset, one: int, other: int) -> bool:
+    """Tells whether two places of a result hold the same run, as a selection with repetition does."""
+    return result.isel(run=one).equals(result.isel(run=other))
 
 
 def save(result: xr.Dataset, path: str | Path) -> None:

@@ -293,10 +293,7 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
     if not metrics:
         raise InputError("metrics: at least one is needed")
     names = [known(name) for name in metrics]
-    check_kind(result)
-    laps = as_runs(result if "lap" in result.dims else per_lap(result))
-    if not (laps.sizes["run"] and laps.sizes["lap"]):
-        raise InputError("result: no laps" if laps.sizes["run"] else "result: no runs")
+    laps = _laps(result, "result")
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     figure, axes = _figure(
@@ -339,16 +336,17 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     The legend says how many failed, in all cases.
 
     Args:
-        cases: Datasets as `metrics.per_lap` returns them, by title.
+        cases: What `simulate` or `metrics.per_lap` returns, by title.
         metric: One of `METRICS`.
         changes: Numbers of laps at whose beginning something changes; dotted lines mark them.
 
     Raises:
-        InputError: The metric is unknown, or there is no case.
+        InputError: The metric is unknown, there is no case, or one has no run or no lap.
     """
     scale, text = _shown(known(metric))
     if not cases:
         raise InputError("cases: at least one is needed")
+    cases = {title: _laps(case, f"cases: {title}") for title, case in cases.items()}
     columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
     rows = -(-len(cases) // columns)
     figure, axes = _figure(PAGE_WIDTH, (0.12 + 0.55 * rows) * COLUMN_WIDTH, rows=rows, columns=columns, sharey=True)
@@ -602,6 +600,19 @@ def _shown(metric: str) -> tuple[float, str]:
     unit, text = METRICS[metric]
     factor, unit = shown_unit(unit)
     return factor, f"{text} ({unit})" if unit else text
+
+
+def _laps(result: xr.Dataset, title: str) -> xr.Dataset:
+    """Returns the metrics of each lap of what `simulate` or `metrics.per_lap` returns.
+
+    Raises:
+        InputError: It is no dataset, or it has no run or no lap.
+    """
+    check_kind(result)
+    laps = as_runs(result if "lap" in result.dims else per_lap(result))
+    if not (laps.sizes["run"] and laps.sizes["lap"]):
+        raise InputError(f"{title}: no laps" if laps.sizes["run"] else f"{title}: no runs")
+    return laps
 
 
 def _plant(*results: xr.Dataset) -> str:

@@ -35,6 +35,7 @@ from mrctl.viewer.looks import Look, looks, told_apart
 
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
 PATH_HEIGHT = 0.01  # m, height of a path above the ground
+SCENE_FIELDS = ("world", "obstacles", "robot", "control_period")  # in which runs must agree to share a scene
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
 
@@ -211,10 +212,14 @@ def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]
     for r, label in zip(recordings, labels, strict=True):
         if not np.isfinite(r.log["x"][0]):
             raise InputError(f"run: {label} had failed before {r.start:g} s")
-        for field in ("world", "obstacles", "robot", "control_period"):
-            if getattr(r.scenario, field) != getattr(first, field):
-                raise InputError(f"run: {label} drove with another {field} than {labels[0]}")
+        if field := difference(r.scenario, first):
+            raise InputError(f"run: {label} drove with another {field} than {labels[0]}")
     return looks(labels, [r.controller for r in recordings])
+
+
+def difference(one: Scenario, other: Scenario) -> str:
+    """Returns the field in which two runs differ so that they cannot share a scene; "" where there is none."""
+    return next((name for name in SCENE_FIELDS if getattr(one, name) != getattr(other, name)), "")
 
 
 class Library:
@@ -253,7 +258,9 @@ class Library:
             raise InputError(f"run: {self._path} has no run {run}")
 
     def first_shown(self, run: int | None) -> list[int]:
-        """Returns the runs that are shown first: the one that is asked for, or all of a few, or else the first.
+        """Returns the runs that are shown first: the one that is asked for, or the first.
+
+        Beside the first of a few runs there are those that can share its scene.
 
         Raises:
             InputError: There is no such run.
@@ -261,8 +268,14 @@ class Library:
         if run is not None:
             self.check(run)
             return [run]
-        every = [int(k) for k in self.table.index]
-        return every if len(every) <= MAX_SHOWN else every[:1]
+        first, *others = (int(k) for k in self.table.index)
+        if len(others) >= MAX_SHOWN:
+            return [first]
+        return [first, *(k for k in others if not difference(self._scenario(k), self._scenario(first)))]
+
+    def _scenario(self, run: int) -> Scenario:
+        """Returns the scenario of a run."""
+        return jobs.scenario_of(self._path, run) if self._result is None else scenarios_of(self._result)[run]
 
     def recording(self, run: int) -> Recording:
         """Returns a run: one of a result is read, one of a sweep is simulated once more, with the same bits.

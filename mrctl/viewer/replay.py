@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
+from mrctl.record import InputError
 from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, not_before_the_start
 from mrctl.viewer.plots import Plots, references_differ
@@ -86,8 +87,16 @@ class ReplayPage(Page):
             self.on(self._scatter.run, lambda run: self._choose(int(run)))
 
     def _choose(self, run: int) -> None:
-        """Shows a run beside the kept ones, each once."""
-        self._show(list(dict.fromkeys([run, *self._kept])))
+        """Shows a run beside the kept ones, each once.
+
+        Raises:
+            InputError: There is no such run, or it cannot share the scene; the page goes on with the one before.
+        """
+        try:
+            self._show(list(dict.fromkeys([run, *self._kept])))
+        except InputError:
+            self._mark_chosen()
+            raise
 
     def _keep(self) -> None:
         if self.runs[0] not in self._kept:
@@ -127,10 +136,14 @@ class ReplayPage(Page):
         self.scrubber.max = self._interval.max = self._plots.time.max = self.duration
         self._interval.value = (0.0, self.duration)
         self._draw_curves()
-        self._chosen.value = float(runs[0])
-        if self._scatter is not None:
-            self._scatter.show(runs[0])
+        self._mark_chosen()
         self._scrub(self.time, pause=False)
+
+    def _mark_chosen(self) -> None:
+        """Shows in the inputs which run is shown."""
+        self._chosen.value = float(self.runs[0])
+        if self._scatter is not None:
+            self._scatter.show(self.runs[0])
 
     def _draw_curves(self) -> None:
         """Draws the curves in the chosen interval, the finer the shorter it is."""

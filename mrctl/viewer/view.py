@@ -94,8 +94,8 @@ def replay(folder: Path, run: int | None, export: Path | None, host: str, port: 
         return _serve(lambda server: ReplayPage(library, shown, server), host, port)
     recordings = [library.recording(k) for k in shown]
     write(recordings, looks_of(recordings, shown), export)
-    count = len(library.table)
-    left_out = f" (run {shown[0]} of {count}; --run takes another)" if len(shown) < count else ""
+    count, those = len(library.table), ", ".join(map(str, shown))
+    left_out = f" (run{'s' * (len(shown) > 1)} {those} of {count}; --run takes another)" if len(shown) < count else ""
     print(f"page: {export}{left_out}")
 
 

@@ -287,6 +287,7 @@ def test_render():
             "perturbation.payload: the centre of mass",
         ),
         ({"perturbation": ["all"]}, "perturbation: 1 of them for 2 robots"),
+        (5, "options: must be a dictionary"),
     ],
 )
 def test_bad_options(options, message):

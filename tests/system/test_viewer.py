@@ -23,7 +23,7 @@ from mrctl.sweep import jobs
 from mrctl.viewer.live import Live
 from mrctl.viewer.looks import looks
 from mrctl.viewer.plots import CURSOR_COLOUR
-from mrctl.viewer.recording import Library
+from mrctl.viewer.recording import Library, looks_of
 from mrctl.viewer.replay import ReplayPage
 from mrctl.viewer.requests import buttons
 from mrctl.viewer.scatter import DROVE_COLOUR, RING_SIZE
@@ -906,11 +906,24 @@ def test_colours_of_a_sweep(tmp_path):
         if column == "world":  # a ghost in another world is refused by its number
             replay._keep()
             other = library.table.index[library.table["world"] == "slope"][0]
+            replay._chosen.value = scatter.run.value = float(other)
             replay.ask(replay._choose, other)
             replay._run_requests()
             assert replay.message == f"run: PID alone 0 drove with another world than PID alone {other}"
-            assert replay.runs == [0]
+            assert replay.runs == [0] and replay._chosen.value == scatter.run.value == 0
         server.stop()
+
+
+def test_runs_of_several_worlds(tmp_path):
+    """A result of a few runs opens with its first one, and with those that can stand in the same scene."""
+    drive = Scenario(laps=1, reference=Circle(period=4.0, radius=0.5), learner="none")
+    result = simulate([drive, drive.replace(world="slope"), drive.replace(seed=1)])
+    for runs, shown in ((slice(None), [0, 2]), ([1, 0], [0]), ([2, 0], [0, 1])):
+        save(result.isel(run=runs), tmp_path / "result.zarr")
+        library = Library(tmp_path / "result.zarr")
+        assert library.first_shown(None) == shown
+        assert len(looks_of([library.recording(k) for k in shown], shown)) == len(shown)
+        shutil.rmtree(tmp_path / "result.zarr")
 
 
 @pytest.mark.usefixtures("here")

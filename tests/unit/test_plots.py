@@ -366,6 +366,14 @@ def test_laps_by_case():
     assert "(J)" in first.get_ylabel()
 
 
+def test_laps_of_a_result():
+    """What `simulate` returns is drawn as its metrics of each lap are."""
+    result = make()
+    drawn = [plots.laps_by_case({"one": case}, "energy").axes[0].lines for case in (result, metrics.per_lap(result))]
+    for left, right in zip(*drawn, strict=True):
+        np.testing.assert_array_equal(left.get_xydata(), right.get_xydata())
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_numbers_of_laps(count):
     """Laps are whole, also where there is one alone."""
