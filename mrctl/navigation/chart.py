@@ -159,7 +159,9 @@ def in_view(points: Array, scan: Scan, margin: float) -> NDArray[np.bool]:
     """
     dx, dy = (points - scan.place[:2]).T
     away, turned = np.hypot(dx, dy), np.arctan2(dy, dx) - scan.place[2] - scan.angles[0]
-    beam = np.round(turned / scan.step).astype(int) % scan.full_turn
+    # From half a step before the first beam; a turn need not be a whole number of steps.
+    beam = ((turned + scan.step / 2) % (2 * np.pi) / scan.step).astype(int)
+    beam = np.minimum(beam, int(np.ceil(2 * np.pi / scan.step - 1e-9)) - 1)  # despite rounding at the end of the turn
     seen = beam < len(scan.ranges)
     return seen & (away <= scan.reach) & (away < scan.ranges[np.where(seen, beam, 0)] + margin)
 
