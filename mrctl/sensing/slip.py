@@ -19,8 +19,9 @@ def slip_ratio(
     where v_i is the circumferential speed of a wheel from its encoder, and u_i the speed of its axle over the floor by
     the motion that is estimated for the same time. The low-pass prevents a jolt from counting as slip, and prolongs a
     slip until it has left the filters of a learner. Odometry, whose V is the mean of the encoders, shows about half of
-    the slip of one wheel. A relative error of the wheel radius appears as a slip ratio of the same size, and noise as
-    one of 0.8 of its standard deviation over the speed.
+    the slip of one wheel. A relative error of the wheel radius appears as a slip ratio of the same size, and noise of
+    one wheel, of V or of D θ̇ as one of 0.8 of its standard deviation over the speed; the same noise of both wheels
+    gives 1.1, and that of V and D θ̇ 1.6 of it, as the larger ratio counts.
 
     Args:
         rates: φ̇ left and right from the encoders in rad/s, `(2,)`.

@@ -369,6 +369,24 @@ def test_slip_ratio():
     assert slip_of([0.015, 0.0], 0.0, 0.0) == pytest.approx(0.05)
 
 
+def test_slip_of_noise():
+    """Noise shows as the mean of the larger |n| of both wheels: √(2/π) of one wheel or V, √2 times that, and twice."""
+    own, other = 0.02 * np.random.default_rng(0).standard_normal((2, 5000)) / 0.1
+    none = np.zeros_like(own)
+    for wheels, v, turn, factor in (
+        ((own, none), none, none, 0.8),
+        ((none, none), own, none, 0.8),
+        ((own, other), none, none, 1.1),
+        ((none, none), own, other, 1.6),
+    ):
+        slip, total = 0.0, 0.0
+        for left, right, ahead, around in zip(*wheels, v, turn, strict=True):
+            rates = np.array([20.0 + left, 20.0 + right])
+            slip = slip_ratio(rates, 2.0 + 0.1 * ahead, 0.1 * around / 0.2, 0.1, 0.2, PERIOD, slip)
+            total += slip / len(own)
+        assert total == pytest.approx(factor * 0.02 / 2.0, rel=0.05)
+
+
 def test_slip_lasts():
     """A slip that has ended fades with the filter's time constant."""
     slip = 1.0
