@@ -31,8 +31,11 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
         speed · sin(direction − φ) = t (θ̇ + φ̇),    speed² = V² + (L θ̇)²,    tan direction = L θ̇ / V
 
     The contact of the front wheel trails the steering axis by t and swings with the fork. Therefore φ follows the
-    quasi-static angle φ_c = atan(L θ̇/V) − asin(t θ̇/speed) with a lag of t/speed. At rest the angle is held. In reverse
-    V and L θ̇ change their signs.
+    quasi-static angle φ_c = atan(L θ̇/V) − asin(t θ̇/speed) with a lag of t/speed. At rest the angle is held.
+
+    In reverse φ_c = atan(L θ̇/V) + asin(t θ̇/speed), and the contact would roll with a lead of t/speed. The lag is kept
+    there: with a trail the contact is dragged sideways where φ_c changes, and θ̇ answers as (1 − s t/speed)/(1 + s
+    t/speed), like a delay of 2 t/speed. Robots that come with mrctl have no trail where they can reverse.
 
     The rate is the derivative of φ_c behind the same lag. It therefore leaves out how the fork catches up where φ_c
     jumps: when a robot leaves rest on an arc, the rate is that of the angle only some lags later.

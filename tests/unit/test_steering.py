@@ -101,6 +101,22 @@ def test_contact_rolls(robot):
     assert drag(kinematics.scrub_free_angle(motion.twist, robot)) > 20 * drag(angle)  # the lag is what does it
 
 
+def test_trail_in_reverse(robot):
+    """In reverse a contact that does not scrub makes θ̇ as (1 − s t/speed)/(1 + s t/speed), forwards as commanded."""
+    h, w = 1e-3, 20.0
+    omega, last = 0.01 * np.sin(w * h * np.arange(3142)), slice(-943, -1)  # ten periods, of which three are looked at
+    trailing = robot.model_copy(update={"trail": 0.02})
+    for v, expected in ((0.3, 1.0), (-0.3, (1 - 1j * w * 0.02 / 0.3) / (1 + 1j * w * 0.02 / 0.3))):
+        allocation, angle = Allocation(trailing, rigid=True, period=h), np.empty_like(omega)
+        for k, (turn, rate) in enumerate(zip(omega, np.gradient(omega, h), strict=True)):
+            allocation([v, turn], [0.0, rate])
+            angle[k] = allocation.angle
+        swing = trailing.trail * np.gradient(angle, h)
+        made = (v * np.sin(angle) + swing) / (trailing.wheelbase * np.cos(angle) - trailing.trail)
+        wave = np.exp(-1j * w * h * np.arange(len(omega)))[last]
+        assert (made[last] @ wave) / (omega[last] @ wave) == pytest.approx(expected, abs=0.02)
+
+
 @given(numbers(2, 3.0), numbers(2, 5.0))
 def test_rigid(stiff, twist, acceleration):
     """Without trail the angle is atan(L θ̇/V) at once, forwards and in reverse, and its rate the derivative."""
