@@ -140,6 +140,13 @@ class Record(BaseModel, metaclass=_Constructors):
 
     @model_validator(mode="before")
     @classmethod
+    def _has_paths_as_text(cls, values: Any) -> Any:  # noqa: ANN401
+        if not isinstance(values, dict):
+            return values
+        return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+
+    @model_validator(mode="before")
+    @classmethod
     def _knows_moved_fields(cls, values: Any) -> Any:  # noqa: ANN401
         for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
             raise ValueError(f"{name}: {FIELD_GONE}; {cls.moved[name]}")

@@ -218,6 +218,15 @@ def test_names_in_the_place_of_records():
         Scenario.from_dict({"sensing": "fild"})
 
 
+def test_paths():
+    """A `pathlib.Path` is as good as its text where a field names a file, as it is for `load_robot` and `from_toml`."""
+    fields = {"robot": "robot.xml", "world": "world.xml", "learned": "learned.safetensors", "fel": {"weights": "w.pt"}}
+    paths = {name: Path(text) for name, text in fields.items() if isinstance(text, str)}
+    assert Scenario(**paths, fel={"weights": Path("w.pt")}) == Scenario.from_dict(fields)
+    with pytest.raises(InputError, match=r"^obstacles: no file none\.toml$"):
+        Scenario(obstacles=Path("none.toml"))
+
+
 @pytest.mark.parametrize(
     ("values", "says"),
     [
