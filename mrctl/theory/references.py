@@ -532,7 +532,9 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
     ):
         worst = int(np.argmax(np.abs(values)))
         if not (peak := abs(values[worst])) <= bound * (1 + 1e-9):  # NaN is refused, too
-            return f"{name} {peak:.3g} {unit} at t = {t[worst]:.2f} s exceeds the robot's {limit} {bound:.3g} {unit}"
+            digits = next(n for n in range(3, 18) if f"{peak:.{n}g}" != f"{bound:.{n}g}")  # that tell them apart
+            most = f"{limit} {bound:.{digits}g} {unit}"
+            return f"{name} {peak:.{digits}g} {unit} at t = {t[worst]:.2f} s exceeds the robot's {most}"
     return ""
 
 

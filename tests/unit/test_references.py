@@ -248,6 +248,7 @@ def test_defaults_pass(kind):
         (Circle(radius=0.2, period=100), {}, "circle: steering angle 1.11 rad .*steering_limit 1.05 rad"),
         (Circle(), {"tyre_friction": 0.05}, "circle: lateral acceleration 0.617 m/s² .*tyre_friction .* 0.491 m/s²"),
         (StopAndGo(move_time=2, pause=3000), {}, "stop_and_go: speed 1.87"),
+        (Circle(), {"max_speed": 0.785}, "circle: speed 0.7854 m/s .*max_speed 0.785 m/s"),  # not 0.785 over 0.785
     ],
 )
 def test_check_refuses(reference, change, words):
