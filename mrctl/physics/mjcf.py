@@ -242,8 +242,8 @@ def load_robot(
     Raises:
         InputError: The file has no such robot; the message says which part is missing, ambiguous or impossible.
     """
-    steered = (steering,) if isinstance(steering, str) else tuple(steering)
-    values = {"path": str(path), "wheels": tuple(wheels), "steering": steered, "chassis": chassis}
+    driven, steered = ((names,) if isinstance(names, str) else tuple(names) for names in (wheels, steering))
+    values = {"path": str(path), "wheels": driven, "steering": steered, "chassis": chassis}
     robot = RobotFile.from_dict(values, "robot")
     load(robot=robot)
     return robot

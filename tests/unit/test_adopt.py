@@ -500,6 +500,7 @@ ERRORS = {
     "warm": (document(DIFF, MOTORS.replace("ctrlrange", f"{WARM} ctrlrange")), {}, ("motor_left", "thermal")),
     "one-sided": (document(DIFF, MOTORS.replace("-12 12", "0 12")), {}, ("motor_left", "ctrlrange 0 to 12 V")),
     "no such wheel": (document(DIFF, MOTORS), {"wheels": ("a", "z")}, ("wheels", "'z'", "'a', 'b'")),
+    "wheels as one text": (document(DIFF, MOTORS), {"wheels": "ab"}, ("wheels: 1 joints, 'ab'",)),
     "wheel named twice": (document(DIFF, MOTORS), {"wheels": ("a", "a")}, ("wheels", "'a', 'a'")),
     "wheel named three times": (document(DIFF, MOTORS), {"wheels": ("a", "b", "a")}, ("wheels", "'a', 'b', 'a'")),
     "a wheel as steering": (document(DIFF, MOTORS), {"steering": ("a",)}, ("steering", "'a' is not upright")),
