@@ -14,7 +14,7 @@ from mrctl.control.learners import LEARNERS
 from mrctl.control.weights import arrays_by_name, notes_on, read_arrays, write_arrays
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.results.dataset import scenarios_of, written_by
+from mrctl.results.dataset import check_kind, scenarios_of, written_by
 from mrctl.scenario import Scenario
 
 LAYOUT = "weights_layout"
@@ -41,9 +41,11 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         run: One run of a result, such as `result.isel(run=0)`.
 
     Raises:
-        InputError: There are several runs, the learner keeps nothing, or kept something else in the version of the
-            result, the run failed, what it learned is not finite, or the file has another suffix or cannot be written.
+        InputError: `run` is no result or has several runs, the learner keeps nothing, or kept something else in the
+            version of the result, the run failed, what it learned is not finite, or the file has another suffix or
+            cannot be written.
     """
+    check_kind(run)
     if run.sizes.get("run", 1) != 1:
         raise InputError(f"run: {run.sizes['run']} runs; choose one with isel(run=…)")
     one = run.squeeze("run") if "run" in run.dims else run

@@ -99,6 +99,8 @@ def test_refused(files, tmp_path):
     other = BASE.replace(robot="racecar", reference=Circle(radius=1.5, period=8.0), learned=files["fel"][0])
     with pytest.warns(UserWarning, match=r"fel\.safetensors was learned on the robot car, not on racecar$"):
         Simulation([other])
+    with pytest.raises(InputError, match="^result: must be an xarray.Dataset, .* not of type PosixPath$"):
+        mrctl.save_learned(files["fel"][1], tmp_path / "x.safetensors")  # in the order of `mrctl.save`
     with pytest.raises(InputError, match="^run: 2 runs; choose one"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
     with pytest.raises(InputError, match="^learned: no learner of the run keeps anything"):
