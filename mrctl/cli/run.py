@@ -51,6 +51,8 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
             return _repeat_saved(file, arguments, out, json, controller)
         if file is not None and str(file) != scenario_file:
             check_switches(arguments)
+            if file.suffix == ".xml":
+                raise InputError(f"{file}: the file of a robot is given as --robot {file}")
             forms = "whose name ends in .toml, nor a reference, which is written as reference:circle"
             raise InputError(f"run: {file} is not a scenario file, {forms}; see mrctl run --help")
         check_world(scenario.world, scenario.robot)

@@ -311,6 +311,7 @@ def test_bad_scenario_is_one_line(
         (["check", "--robot.path", "mule.xml"], "--robot.path: is no flag of mrctl check"),
         (["run", "reference:circle", "--laps", "1"], "--laps: is no flag of reference:circle, and those of mrctl run"),
         (["navigate", "doorway:1", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
+        (["run", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
         (["navigate", "doorway:1", "--sensing.lidar.nois", "3"], "did you mean --sensing.lidar.noise?"),
         (["run", "--lapz=3"], "no flag is called --lapz"),
         (["run", "--out"], "out: needs a value; see mrctl run --help"),
