@@ -26,6 +26,9 @@ else:
 
 MAX_TEXT_BYTES = 4 * 2**20  # bytes, largest text file of settings; one of this size takes some seconds to read
 WRITTEN_BY = "# written by mrctl "  # how a TOML file begins that `to_toml` made
+BOUNDS = "greater_than", "greater_than_equal", "less_than", "less_than_equal"  # errors of pydantic
+_BASE = "(?:kg|rad|Hz|[msNVAΩH])²?"
+UNIT = re.compile(rf" in ({_BASE}(?:[·/]{_BASE})*)(?=[.,;]| (?!per |√))")  # in the docstring of a field
 FIELD_GONE = "this field of an earlier version is gone"
 
 
@@ -298,8 +301,18 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""
         )
         message = f"must be a list{tables}"
+    if first["type"] in BOUNDS:
+        message += _unit(record, first["loc"])
     more = f" (and {len(rest)} more)" if rest else ""
     return printable(": ".join(part for part in (source, field, message) if part) + more)
+
+
+def _unit(record: type[Record] | None, path: Sequence[int | str]) -> str:
+    """Returns the unit that a field's docstring gives, with a space before it; "" where it gives none."""
+    *parents, name = path
+    fields = [one.model_fields[str(name)] for one in _records_at(record, parents) if str(name) in one.model_fields]
+    found = UNIT.search(fields[0].description or "") if fields else None
+    return f" {found[1]}" if found else ""
 
 
 def is_whole(count: float) -> bool:

@@ -218,6 +218,25 @@ def test_names_in_the_place_of_records():
         Scenario.from_dict({"sensing": "fild"})
 
 
+@pytest.mark.parametrize(
+    ("fields", "end"),
+    [
+        ({"perturbation": {"slope": 6.0}}, "perturbation.slope: Input should be less than or equal to 0.5 rad"),
+        ({"perturbation": {"control_delay": 20}}, "less than or equal to 0.5 s"),
+        ({"events": [{"time": 1, "reference": {"kind": "line", "speed": 900}}]}, "less than or equal to 20 m/s"),
+        ({"laps": 0}, "greater than or equal to 1"),
+        ({"mrac": {"noise": 0}}, "greater than or equal to 0.0001"),  # V √s
+        ({"sensing": {"gyro_noise": -1}}, "greater than or equal to 0"),  # rad/s/√Hz
+        ({"pid": {"steering_kp": -1}}, "greater than or equal to 0"),  # rad/s per rad/s
+    ],
+)
+def test_unit_of_a_bound(fields, end):
+    """A bound has the unit of the field's docstring, as who writes degrees or milliseconds must see."""
+    with pytest.raises(InputError) as error:
+        Scenario.from_dict(fields)
+    assert str(error.value).endswith(end)
+
+
 def test_paths():
     """A `pathlib.Path` is as good as its text where a field names a file, as it is for `load_robot` and `from_toml`."""
     fields = {"robot": "robot.xml", "world": "world.xml", "learned": "learned.safetensors", "fel": {"weights": "w.pt"}}
