@@ -54,12 +54,26 @@ class _Interrupts:
             signal.setitimer(signal.ITIMER_REAL, 0.01)
 
 
+def _keep_streams() -> None:
+    """Leads standard streams that are closed, as after `>&-`, to nowhere, in programs that this one starts too.
+
+    Otherwise the next file that is opened gets their number, and what C code prints would go to that file.
+    """
+    for number, name, mode in (0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free: this one
+            setattr(sys, name, open(number, mode, errors="replace", closefd=False))  # noqa: SIM115
+
+
 def main() -> int:
     """Runs the command of the command line; see `mrctl.cli.main`.
 
     Returns:
         The exit status; 130 after Ctrl-C, even if a library turned the interrupt into another error.
     """
+    _keep_streams()
     # At Python's own thresholds the garbage collector looks through what imports and the compiler make again and again,
     # which is a tenth of the time of a short command.
     gc.set_threshold(50_000, 20, 100)

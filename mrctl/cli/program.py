@@ -43,9 +43,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         success, one line on stderr says why.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    if arguments == ["--version"]:
-        print(f"mrctl {__version__}")
-        return 0
     if not sys.stderr.isatty():
         for name, value in TQDM_WITHOUT_TERMINAL.items():
             os.environ.setdefault(f"TQDM_{name}", value)  # which tqdm reads when it is imported
@@ -54,6 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = _once()
     try:
         try:
+            if arguments == ["--version"]:
+                print(f"mrctl {__version__}")
+                return 0
             command = _parse(expanded(arguments))
             for name in ("absl", "asyncio"):  # of failing runs and damaged files, whose own message says why
                 logging.getLogger(name).addFilter(lambda _: False)

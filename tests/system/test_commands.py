@@ -9,6 +9,7 @@ import sys
 import typing
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -517,6 +518,20 @@ def test_version(capsys: pytest.CaptureFixture) -> None:
 
 UNIT = r"(?<=[ (])(1/)?(k?g|m|s|rad|V|A|N|H|Ω|Hz)([·/]√?(m|s|rad|V|A|kg|Hz)[²³]?)*[²³]?(?=[ .,;:)])"
 DIMENSIONLESS = r"\b([Ff]actor|[Rr]atio|[Ss]hare|[Cc]oefficient|[Nn]umber of|[Dd]imensionless)\b"
+
+
+def test_closed_streams() -> None:
+    """A command whose output is closed says what is wrong, and ends with the status of that."""
+    line = f"{sys.executable} -m mrctl run --laps x <&- >&-"
+    ended = subprocess.run(["sh", "-c", line], check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (2, "mrctl: laps: 'x' is not a whole number\n")
+
+
+def test_version_on_a_full_disk(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stdout, "write", mock.Mock(side_effect=OSError(28, "No space left on device")))
+        assert cli.main(["--version"]) == 2
+    assert capsys.readouterr().err == "mrctl: No space left on device\n"
 
 
 def records_of(kind: Any) -> set[type[Record]]:
