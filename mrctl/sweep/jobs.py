@@ -104,7 +104,10 @@ def run(
                     pool.close()
             if pending or not store.complete:
                 lost = {job: [_row(sweep, k, SET_ASIDE + why) for k in store.runs(job)] for job, why in aside.items()}
-                rows = (_table(sweep, lost[job]) if job in lost else store.rows(job) for job in range(store.jobs))
+                rows = (
+                    _table(sweep, lost[job]) if job in lost else store.rows(job, sweep.columns)
+                    for job in range(store.jobs)
+                )
                 store.finish(sweep.columns, rows, complete=not aside)
             failed = _failed([store.table])
             return SweepReport(store.size, failed, {store.runs(job): why for job, why in sorted(aside.items())})

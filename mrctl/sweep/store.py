@@ -254,8 +254,9 @@ class Store:
 
     def done(self) -> set[int]:
         """Returns the numbers of the jobs that are done; one whose signals are missing has to be done again."""
-        parts = {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
-        found = set(range(self.jobs)) if self.complete else parts
+        jobs, parts = range(self.jobs), (self.path / "parts").glob("[0-9]*.parquet")
+        numbers = {int(part.stem) for part in parts if part.stem.isdecimal()}  # "000012 (copy)" is no part
+        found = set(jobs) if self.complete else {job for job in numbers if job in jobs and self._part(job).exists()}
         return {job for job in found if not self._lost(job)}
 
     def _lost(self, job: int) -> bool:
@@ -297,12 +298,23 @@ class Store:
         found = ((job, self._shard(job)) for job in sorted(set(jobs[_drove(frame)])))
         return {shard: frame["run"][jobs == job].tolist() for job, shard in found if not shard.exists()}
 
-    def rows(self, job: int) -> pa.Table:
-        """Returns the rows of a job that is done."""
-        source, runs = (self._part(job), None) if self._part(job).exists() else (self.table, self.runs(job))
-        filters = None if runs is None else [("run", ">=", runs.start), ("run", "<", runs.stop)]
+    def rows(self, job: int, columns: pa.Schema | None = None) -> pa.Table:
+        """Returns the rows of a job that is done.
+
+        Args:
+            job: Number of the job.
+            columns: Columns that its file must have; by default those that it has.
+
+        Raises:
+            InputError: The file is damaged, or holds other runs or columns.
+        """
+        source, runs = self._part(job) if self._part(job).exists() else self.table, self.runs(job)
+        filters = [("run", ">=", runs.start), ("run", "<", runs.stop)] if source == self.table else None
         with reading(source):
-            return pq.read_table(source, filters=filters, page_checksum_verification=True)
+            found = pq.read_table(source, filters=filters, page_checksum_verification=True)
+            if found["run"].to_pylist() != [*runs]:
+                raise InputError(f"{source}: damaged: it does not hold runs {runs[0]} to {runs[-1]}")
+            return found if columns is None else found.cast(columns)
 
     def row(self, run: int) -> dict[str, Any] | None:
         """Returns the row of one run, or None if the run is not done."""

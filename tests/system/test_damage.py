@@ -203,6 +203,44 @@ def test_missing_shard_is_computed_again(whole: Path, tmp_path: Path, capsys: py
         assert (tmp_path / "store" / file).read_bytes() == (whole / "store" / file).read_bytes(), file
 
 
+def swapped(parts: Path) -> None:
+    shutil.copy(parts / "000000.parquet", parts / "000001.parquet")
+
+
+def renamed(parts: Path) -> None:
+    """Gives a column another name, as one bit that flips in the description of the table does."""
+    table = pq.read_table(file := parts / "000001.parquet")
+    pq.write_table(table.rename_columns({"v_rmse": "v_rmsd"}), file)
+
+
+def copied(parts: Path) -> None:
+    shutil.copy(parts / "000001.parquet", parts / "000001 (copy).parquet")
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (swapped, "000001.parquet: damaged: it does not hold runs 2 to 3"),
+        (renamed, "000001.parquet: damaged.* names"),
+        (copied, ""),
+    ],
+)
+def test_a_part_is_that_of_its_job(whole: Path, tmp_path: Path, damage: Callable[[Path], None], says: str) -> None:
+    """No table is made of rows of other runs or columns; a copy beside a part does no harm."""
+    store = shutil.copytree(whole / "store", tmp_path / "store")
+    (parts := store / "parts").mkdir()
+    for job in range(2):
+        pq.write_table(pq.read_table(store / "runs.parquet").slice(2 * job, 2), parts / f"{job:06d}.parquet")
+    (store / "runs.parquet").unlink()
+    damage(parts)
+    if says:
+        with pytest.raises(InputError, match=says):
+            jobs.run(Sweep.from_dict(SWEEP), store, 1)
+        assert not (store / "runs.parquet").exists()
+    else:
+        assert jobs.run(Sweep.from_dict(SWEEP), store, 1).runs == 4
+
+
 def test_refused_before_anything_is_driven(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A run that is not there, a file that is, a store whose code may not run: one line, and nothing is simulated."""
     (tmp_path / "x.html").write_text("mine")
