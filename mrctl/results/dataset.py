@@ -310,10 +310,10 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     path = Path(path)
     if path.suffix in (".nc", ".h5"):
         raise InputError(f"{path}: a result is saved as a folder in Zarr; result.to_netcdf(path) writes NetCDF")
-    if path.exists():
-        raise InputError(f"{path}: exists already, nothing was overwritten")
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
+        if path.exists():
+            raise InputError(f"{path}: exists already, nothing was overwritten")
         partial.parent.mkdir(parents=True, exist_ok=True)
         checked = {str(name): {"compressors": (ZstdCodec(), Crc32cCodec())} for name in result.variables}
         result = result.assign_attrs({VARIABLE_NAMES: sorted(map(str, result.variables))})

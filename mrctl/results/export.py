@@ -129,14 +129,14 @@ def export(
         if run not in whole["run"]:
             raise InputError(f"run: the result has no run {run}")
         whole = whole.sel(run=[run])
-    if out.exists():
-        raise InputError(f"{out}: exists already, nothing was overwritten")
-    several, whole = whole.sizes["run"] > 1, _that_drove(whole)
     writers: dict[Format, Callable[[xr.Dataset, bool, Path], None]] = {
         "mcap": partial(_mcap, scenario), "csv": _csv, "parquet": _parquet, "npz": _npz,
     }  # fmt: skip
     unfinished = out.with_name(f".{out.name}.{uuid.uuid4().hex}.partial")
     try:
+        if out.exists():
+            raise InputError(f"{out}: exists already, nothing was overwritten")
+        several, whole = whole.sizes["run"] > 1, _that_drove(whole)
         out.parent.mkdir(parents=True, exist_ok=True)
         writers[to](whole, several, unfinished)
         unfinished.rename(out)
@@ -199,12 +199,11 @@ def _table(whole: xr.Dataset, several: bool) -> Iterator[pa.Table]:
 
 
 def _parquet(whole: xr.Dataset, several: bool, path: Path) -> None:
-    writer = None
-    for table in _table(whole, several):
-        writer = writer or pq.ParquetWriter(path, table.schema)
-        writer.write_table(table)
-    if writer:
-        writer.close()
+    with contextlib.ExitStack() as opened:
+        file, writer = opened.enter_context(open(path, "wb")), None  # Arrow opens no name that is not UTF-8
+        for table in _table(whole, several):
+            writer = writer or opened.enter_context(pq.ParquetWriter(file, table.schema))
+            writer.write_table(table)
 
 
 def _csv(whole: xr.Dataset, several: bool, path: Path) -> None:

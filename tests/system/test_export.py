@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shutil
 import sys
 from itertools import islice
@@ -374,6 +375,17 @@ def test_command(path, tmp_path, capsys):
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and message in error, error
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.csv"]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npz", "mcap"])
+def test_odd_names(result, tmp_path, kind):
+    """A name that is not UTF-8 is one like others, and one that is too long gets a line that says so."""
+    alone = tmp_path / os.fsdecode(b"\xff.out")
+    export(result, kind, alone, run=0)
+    assert alone.stat().st_size > 0
+    with pytest.raises(InputError, match="too long"):
+        export(result, kind, tmp_path / ("n" * 300))
+    assert list(tmp_path.iterdir()) == [alone]
 
 
 def test_without_library(path, tmp_path, monkeypatch):

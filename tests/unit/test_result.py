@@ -231,6 +231,11 @@ def test_not_a_folder(small, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
+def test_too_long_a_name(small, tmp_path):
+    with pytest.raises(InputError, match="too long"):
+        save(small, tmp_path / ("n" * 300))
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_read_only(small, tmp_path):
     """A folder without permission."""
