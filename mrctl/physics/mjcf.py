@@ -154,7 +154,7 @@ def _assembled(world: Path, robot: RobotFile) -> mujoco.MjSpec:
     A file with the names of the default robot's parts takes the place of `car.xml` in a world that includes it, and so
     keeps its servo and its steering arrangements. The robot of any other file is adopted.
     """
-    if robot != CAR and robot == RobotFile(path=robot.path) and INCLUDED in world.read_text():
+    if robot != CAR and robot == RobotFile(path=robot.path) and INCLUDED in world.read_text("utf-8", "replace"):
         own = mujoco.MjSpec.from_file(str(robot_path(robot)))
         if _has_names_of_car(own):
             return _in_place_of_car(world, robot_path(robot), own)
@@ -168,7 +168,7 @@ def _in_place_of_car(world: Path, path: Path, own: mujoco.MjSpec) -> mujoco.MjSp
     """
     texts, left = {f"{CAR.path}.xml": path.read_bytes()}, [path]
     while left:
-        for name in re.findall(r'<include\s+file="([^"]+)"', left.pop().read_text()):
+        for name in re.findall(r'<include\s+file="([^"]+)"', left.pop().read_text("utf-8", "replace")):
             if (file := path.parent / name).is_file():
                 texts[name] = file.read_bytes()
                 left.append(file)

@@ -197,6 +197,13 @@ def test_missing_file(tmp_path):
             mjcf.load(world)
 
 
+def test_latin_1(folder):
+    """MuJoCo reads a world in any encoding, and so does a robot that drives in it."""
+    world = folder / "flat.xml"
+    world.write_bytes("<!-- café -->\n".encode("latin-1") + world.read_bytes())
+    assert mjcf.load(str(world), robot=RobotFile(path="turtlebot")).nu == 2
+
+
 def test_broken_xml(folder):
     """Files that are not XML, not MJCF, or miss an include are refused."""
     world = folder / "flat.xml"
