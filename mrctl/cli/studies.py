@@ -96,7 +96,8 @@ def suite(
     counts = (REPLICATES[mode] if seeds is None else seeds), (RANDOM[mode] if random is None else random)
     compared = entries(mode) if feedforward is None else feedforward
     aside = uncertainty.suite(mode, compared, controller, *counts, workers, folder).aside
-    print(f"{(folder / 'table.md').read_text()}\nReport: {folder / 'report.html'}")
+    tables = (folder / "table.md").read_text("utf-8")
+    print(f"{tables}\nReport: {folder / 'report.html'}")
     expect_all(aside)
 
 
@@ -106,7 +107,7 @@ def _judge_held_out(names: Sequence[str], seeds: int | None, workers: int | None
     from mrctl.experiments.cases import REPLICATES
 
     aside = held_out.judge(names, REPLICATES["core"] if seeds is None else seeds, workers, folder)
-    print((folder / "table.md").read_text())
+    print((folder / "table.md").read_text("utf-8"))
     expect_all(aside)
 
 

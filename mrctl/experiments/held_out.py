@@ -139,7 +139,7 @@ def judge(entries: Sequence[str], count: int, workers: int | None, out: Path) ->
         shown += [table.markdown for table in tables]
         if name in fresh or not _said(out, entry):
             _log(out, {"entry": entry} | this | {"says": tables[0].says})
-    (out / "table.md").write_text("\n".join(shown))
+    (out / "table.md").write_text("\n".join(shown), "utf-8")
     source = {"versions": versions(), "machine": machine()}
     write_json(out / "table.json", source | {"mode": "held-out", "cells": rows})
     return aside
@@ -148,8 +148,8 @@ def judge(entries: Sequence[str], count: int, workers: int | None, out: Path) ->
 def _log(out: Path, values: Mapping[str, Any]) -> None:
     """Adds a line to the log, so that a drive that was begun is on record even without a result."""
     log = out / LOG_FILE
-    torn = log.exists() and not log.read_text().endswith("\n")
-    with log.open("a") as file:
+    torn = log.exists() and not log.read_text("utf-8").endswith("\n")
+    with log.open("a", encoding="utf-8") as file:
         line = json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values})
         file.write("\n" * torn + line + "\n")
 
@@ -166,7 +166,7 @@ def logged(log: str) -> list[dict[str, Any]]:
 def _said(out: Path, entry: str) -> bool:
     """Tells whether the last line of the log on a feedforward has its result, and not only that a drive was begun."""
     log = out / LOG_FILE
-    own = [line for line in logged(log.read_text() if log.exists() else "") if line["entry"] == entry]
+    own = [line for line in logged(log.read_text("utf-8") if log.exists() else "") if line["entry"] == entry]
     return bool(own) and "says" in own[-1]
 
 

@@ -64,7 +64,7 @@ class Journal:
         self.cores = cores() if scheduler is None else threads_of(scheduler)
         self._file, head = file, json.loads(json.dumps(head | origin() | {"code": code_digest(SHOWING_ROOMS)}))
         try:
-            begun = file.read_text() if file.exists() else ""
+            begun = file.read_text("utf-8") if file.exists() else ""
             first, *rest = [json.loads(line) for line in begun[: begun.rfind("\n") + 1].splitlines()] or [head]
             other = next((name for name in head if first.get(name) != head[name]), "" if first == head else "it")
             self._known = {json.dumps(line["key"]): line["value"] for line in rest}
@@ -76,7 +76,7 @@ class Journal:
             raise InputError(f"out: {file} holds other results ({other} differs); choose another folder")
         whole = file.with_name(f".{file.name}.whole")  # which takes the place of the file at once, or not at all
         try:
-            whole.write_text("".join(json.dumps(line) + "\n" for line in (first, *rest)))
+            whole.write_text("".join(json.dumps(line) + "\n" for line in (first, *rest)), "utf-8")
             whole.replace(file)
         except OSError as error:
             raise InputError(f"out: {file}: {error.strerror}") from None
@@ -96,7 +96,7 @@ class Journal:
     def __setitem__(self, key: object, value: object) -> None:
         """Keeps a result, of numbers, strings, lists and dictionaries."""
         line = json.dumps({"key": key, "value": value})
-        with self._file.open("a") as file:
+        with self._file.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
         self._known[json.dumps(key)] = json.loads(line)["value"]
 

@@ -60,7 +60,7 @@ def suite(base: Scenario, mode: Mode, out: Path, scheduler: str | None = None) -
             journal = Journal(out / f"{part.files}.jsonl", source, scheduler, partial(model_of, base))
             found = part.drive(base, mode, journal)
         text = "\n".join(table.markdown for table in part.tables(found, shown))
-        (out / f"{part.files}.md").write_text(text)
+        (out / f"{part.files}.md").write_text(text, "utf-8")
         where = machine() if scheduler is None else {"processor": "a Dask cluster", "cores": journal.cores}
         write_json(out / f"{part.files}.json", source | {"machine": where} | part.values(found))
         yield text

@@ -54,7 +54,7 @@ def write(outcome: Outcome, choices: Choices, tables: Sequence[Table], out: Path
     for name, (figure, caption) in drawn.items():
         png, _ = plots.save(figure, out / "figures", name)
         images[name] = (base64.b64encode(png.read_bytes()).decode(), caption)
-    (out / "report.html").write_text(page(outcome, choices, tables, images))
+    (out / "report.html").write_text(page(outcome, choices, tables, images), "utf-8")
 
 
 def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
@@ -177,7 +177,7 @@ def page(
     fixed = [case for case in outcome.cases if case.part != "random"]
     random = _worlds(outcome)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(TEMPLATE.read_text()).render(
+    return environment.from_string(TEMPLATE.read_text("utf-8")).render(
         runs=sum(len(case.scenarios) for case in outcome.cases) * len(choices),
         cases=len(fixed),
         seeds=len(fixed[0].scenarios),

@@ -138,7 +138,7 @@ def main(
     page = (sections(_text(out)) if out.exists() else {"": BEGINNING}) | written
     parts = [f"## {title}\n\n{text}" if title else text for title, text in page.items()]
     try:
-        out.write_text(narrow("\n\n".join(parts)) + "\n")
+        out.write_text(narrow("\n\n".join(parts)) + "\n", "utf-8")
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from None
 
@@ -175,7 +175,7 @@ def _driven(folder: Path, command: str) -> Path:
         raise InputError(f"everything: mrctl {command} ended with status {done.returncode}")
     if shown:
         place.write_bytes(done.stdout)
-    with (folder / ENDED_FILE).open("a") as file:
+    with (folder / ENDED_FILE).open("a", encoding="utf-8") as file:
         file.write(f"{_ending(command)}\n")
     return place
 
@@ -188,9 +188,9 @@ def _ended(folder: Path, command: str) -> bool:
     """
     place = folder / command.split()[-1]
     with suppress(OSError, ValueError, LookupError):
-        table = json.loads((place if place.suffix else place / "table.json").read_text())
+        table = json.loads((place if place.suffix else place / "table.json").read_text("utf-8"))
         written = (table.get("versions") or table["machine"])["mrctl"]
-        return written == __version__ and _ending(command) in (folder / ENDED_FILE).read_text().splitlines()
+        return written == __version__ and _ending(command) in (folder / ENDED_FILE).read_text("utf-8").splitlines()
     return False
 
 
@@ -423,7 +423,7 @@ def _navigated(folders: Sequence[Path], name: str, key: str) -> str:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text()
+        return path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
 

@@ -98,7 +98,7 @@ def suite(
     rows = compare(chosen, runs)
     outcome = Outcome(mode, chosen, laps, runs, rows, aside)
     shown = tables(rows, mode)
-    (out / "table.md").write_text("\n".join(one.markdown for one in shown))
+    (out / "table.md").write_text("\n".join(one.markdown for one in shown), "utf-8")
     found = {"versions": versions(), "machine": machine(), "mode": mode, "controllers": report.controllers(choices)}
     write_json(out / "table.json", found | {"rows": rows, "runs": each_run(runs)})
     report.write(outcome, choices, shown, out)

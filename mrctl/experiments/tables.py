@@ -160,7 +160,7 @@ def json_text(values: object) -> str:
 
 def write_json(path: Path, values: object) -> None:
     """Writes JSON with NaN and infinity as null."""
-    path.write_text(json_text(values) + "\n")
+    path.write_text(json_text(values) + "\n", "utf-8")
 
 
 def _finite(values: object) -> object:

@@ -330,7 +330,7 @@ def _seal(folder: Path) -> None:
     """Adds the checksums of its metadata to a result; its chunks have checksums of their own."""
     about = json.loads((folder / "zarr.json").read_bytes())
     about["attributes"][CHECKSUMS] = _checksums(folder)
-    (folder / "zarr.json").write_text(json.dumps(about, indent=2))
+    (folder / "zarr.json").write_text(json.dumps(about, indent=2), "utf-8")
 
 
 def checksum(values: dict[str, object]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import json
 import re
@@ -40,8 +41,10 @@ def export(recordings: Sequence[Recording], robots: Sequence[Look], path: Path) 
     """
     refuse_existing(path)
     try:
-        path.write_text(page(recordings, robots))
+        path.write_text(page(recordings, robots), "utf-8")
     except OSError as error:
+        with contextlib.suppress(OSError):
+            path.unlink()  # half a page would be in the way of the next attempt
         raise InputError(f"export: {path}: {error.strerror or error}") from None
 
 
@@ -65,7 +68,7 @@ def page(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
         "scene": html.escape(_scene(recordings, robots, magnification(extent(log)))),
         "data": _curves(times, charts(log, robots, recordings[0].period, clearance, apart), event_times(recordings)),
     }
-    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], PLAYER.read_text())
+    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], PLAYER.read_text("utf-8"))
 
 
 def _scene(recordings: Sequence[Recording], robots: Sequence[Look], magnified: int) -> str:

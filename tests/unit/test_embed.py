@@ -1,12 +1,15 @@
 """Replays inside notebooks; `tests/system/test_notebooks.py` looks at them in a browser."""
 
 import html
+import io
 import json
 import re
+from pathlib import Path
 
 import pytest
 
 import mrctl
+from mrctl.viewer import export
 from mrctl.viewer.recording import Recording, looks_of
 
 
@@ -64,3 +67,21 @@ def test_refused(result):
         mrctl.replay(failed.sel(time=slice(3, 4)))
     with pytest.raises(mrctl.InputError, match="run: PID . model had failed before 3 s"):  # as for `mrctl view`
         looks_of([Recording(failed.sel(time=slice(3, 4)).isel(run=0))], [0])
+
+
+def test_page_is_written_whole_in_every_locale(tmp_path, monkeypatch):
+    """A page is UTF-8 in the locale C, and half a page on a full disk is not in the way of the next one."""
+    monkeypatch.setattr(io, "text_encoding", lambda encoding, *_: encoding or "ascii")
+    monkeypatch.setattr(export, "page", lambda *_: "■")
+    write = Path.write_text
+
+    def half(path, *_):
+        write(path, "half", "utf-8")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_text", half)
+        with pytest.raises(mrctl.InputError, match="No space"):
+            export.export([], [], tmp_path / "page.html")
+    export.export([], [], tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_bytes() == "■".encode()

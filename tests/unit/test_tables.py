@@ -1,12 +1,14 @@
 """The folder that a command writes to."""
 
+import io
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mrctl import InputError
-from mrctl.experiments.tables import centre_cell, output_folder
+from mrctl.experiments.tables import centre_cell, output_folder, write_json
 
 
 def test_refused_command_leaves_nothing(tmp_path: Path) -> None:
@@ -32,6 +34,13 @@ def test_what_exists_is_kept(tmp_path: Path) -> None:
     with output_folder(tmp_path, ["x"]):
         pass
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {".writable": "mine", "table.json": "mine"}
+
+
+def test_json_is_utf8(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file is the same in every locale."""
+    monkeypatch.setattr(io, "text_encoding", lambda encoding, *_: encoding or "ascii")  # that of the locale C
+    write_json(tmp_path / "table.json", {"θ̇": 1})
+    assert json.loads((tmp_path / "table.json").read_bytes()) == {"θ̇": 1}
 
 
 def test_centre_cell() -> None:
