@@ -16,6 +16,7 @@ import gc
 import hashlib
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from functools import cache, cached_property, update_wrapper
 from pathlib import Path
@@ -75,7 +76,9 @@ class Kernel(Generic[P, T]):
         update_wrapper(versioned, law)
         # A check of each division for zero would keep loops with a division from vector instructions.
         options |= {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-        return njit(**options)(versioned)
+        made: Any = njit(**options)(versioned)
+        made._cache.save_overload = _where_possible(made._cache.save_overload)
+        return made
 
     def repeated(self) -> Callable[..., T]:
         """Returns the compiled function for one caller, who promises that the types of its arguments never change.
@@ -194,6 +197,19 @@ def _reader(kinds: Any) -> Any:  # noqa: ANN401
     reader: Any = intrinsic(arrays)
     reader.kinds = kinds.name
     return reader
+
+
+def _where_possible(save: Callable[..., None]) -> Callable[..., None]:
+    """Returns what keeps machine code on disk as `save` does, but only warns where the disk is full."""
+
+    def kept(*overload: Any) -> None:  # noqa: ANN401
+        try:
+            save(*overload)
+        except OSError as error:
+            again = "each program compiles them again, unless NUMBA_CACHE_DIR names another folder"
+            warnings.warn(f"compiled laws cannot be kept on disk; {again}: {error.strerror or error}", stacklevel=2)
+
+    return kept
 
 
 def kernel(law: Callable[P, T]) -> Kernel[P, T]:

@@ -10,10 +10,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 from numba.core.errors import TypingError
 
 import mrctl
@@ -418,3 +420,15 @@ def test_a_terminal_sees_a_bar(tmp_path, monkeypatch):
     assert three.outer(1.0) == 5.0
     bar = announced().bar
     assert (bar.n, bar.total) == (3, 3) and "\rthree_laws.outer:   0%" in shown.getvalue()
+
+
+def test_full_disk(monkeypatch):
+    """A law that cannot be kept on disk is compiled and computes all the same."""
+    monkeypatch.setattr(IndexDataCacheFile, "save", mock.Mock(side_effect=OSError(28, "No space left on device")))
+
+    @kernel
+    def doubled(number):
+        return 2 * number
+
+    with pytest.warns(UserWarning, match="cannot be kept on disk.*No space left"):
+        assert doubled.compiled(2.0) == 4
