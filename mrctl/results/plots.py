@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
 
@@ -351,6 +352,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     rows = -(-len(cases) // columns)
     figure, axes = _figure(PAGE_WIDTH, (0.12 + 0.55 * rows) * COLUMN_WIDTH, rows=rows, columns=columns, sharey=True)
     lost: dict[str, list[bool]] = {}  # whether each run failed, by label
+    lines = _lines(_colours(*cases.values()))
     for one, (title, laps) in zip(axes, cases.items(), strict=False):
         number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
         for label in dict.fromkeys(labels):
@@ -358,11 +360,10 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
             failed = laps["failed"].values[own].astype(bool)
             lost.setdefault(label, []).extend(failed.tolist())
             values, whole = _finished(scale * laps[metric].values[own], failed)
-            line = _line([*lost].index(label))
             if whole.any():
                 low, mean, high = (f(values[:, whole], axis=0) for f in (np.min, np.mean, np.max))
-                one.fill_between(number[whole], low, high, color=line["color"], alpha=0.15, lw=0)
-                one.plot(number[whole], mean, marker=".", ms=3, **line)
+                one.fill_between(number[whole], low, high, color=lines[label]["color"], alpha=0.15, lw=0)
+                one.plot(number[whole], mean, marker=".", ms=3, **lines[label])
         for lap in changes:
             one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
         one.set_title(title)
@@ -375,7 +376,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
             one.set_ylabel(text, fontsize=8)
     for unused in axes[len(cases) :]:
         unused.remove()
-    handles = [Line2D([], [], **_line(k)) for k in range(len(lost))]
+    handles = [Line2D([], [], **lines[label]) for label in lost]
     names = [_counted(label, sum(failed), len(failed)) for label, failed in lost.items()]
     columns = 3 if any(map(any, lost.values())) else 4  # the counts make the names longer
     figure.legend(handles, names, loc="outside upper center", ncols=min(columns, len(names)))
@@ -387,20 +388,21 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
     """Draws the share of runs below each value, on a log axis; a failed run, whose value is not finite, is below none.
 
     Args:
-        samples: A positive number for each run, by name.
+        samples: A positive number for each run, by name; a controller of this name gives the colour.
         label: Quantity and unit for the axis.
     """
     figure, (axes,) = _figure(COLUMN_WIDTH, 0.8 * COLUMN_WIDTH)
-    for order, values in enumerate(samples.values()):
+    lines = _lines(dict(zip(samples, colours_of(samples), strict=True)))
+    for name, values in samples.items():
         finite = np.sort(values[np.isfinite(values)])
-        axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **_line(order))
+        axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **lines[name])
     axes.axvline(1, color="0.4", lw=0.8, ls=":")
     axes.set(xlabel=label, ylabel="share of runs", xscale="log", ylim=(0, 1.02))
     low, high = axes.get_xlim()
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5) if high < 40 * low else ()))  # more numbers would overlap
     for formatted in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         formatted("{x:g}")
-    handles = [Line2D([], [], **_line(k)) for k in range(len(samples))]
+    handles = [Line2D([], [], **lines[name]) for name in samples]
     figure.legend(handles, list(samples), loc="outside upper center", ncols=2)
     return figure
 
@@ -426,9 +428,10 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
     figure, axes = _figure(COLUMN_WIDTH, 1.2 * COLUMN_WIDTH, rows=2)
     curves = _curves(found, None, None)
     _signals(axes[0], curves, "least", r"$\lambda_{\min}$ (1)")
-    for order, name in enumerate(found["feature"].values):
+    lines = _lines(dict(zip(PARAMETERS, cycle(COLOURS), strict=False)))
+    for symbol, name in zip(PARAMETERS, found["feature"].values, strict=True):
         signal = found["alone"].isel(run=run).sel(feature=name).values
-        axes[1].plot(found["time"].values, signal, label=PARAMETERS[order], **_line(order))
+        axes[1].plot(found["time"].values, signal, label=symbol, **lines[symbol])
     whose = f", {runs['label'].values[run]}" if runs.sizes["run"] > 1 else ""
     axes[1].set(xlabel="time (s)", ylabel=f"excitation alone (1){whose}")
     for one in axes:
@@ -521,10 +524,10 @@ def _finished(values: Array, failed: NDArray[np.bool_]) -> tuple[Array, NDArray[
     return kept, np.asarray(np.isfinite(kept).all(axis=0))
 
 
-def _line(order: int) -> dict[str, Any]:
-    """Returns colour and dashes of the label at a position in the legend; colours repeat with other dashes."""
-    again, colour = divmod(order, len(COLOURS))
-    return {"color": COLOURS[colour], "ls": ("-", "--", ":")[again % 3]}
+def _lines(colours: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Returns colour and dashes by label; lines beyond the seventh, whose colours repeat or are near, have others."""
+    dashes = [dash for dash in ("-", "--", ":") for _ in COLOURS]
+    return {label: {"color": c, "ls": dash} for (label, c), dash in zip(colours.items(), cycle(dashes), strict=False)}
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey: bool = False) -> tuple[Figure, list]:
@@ -569,13 +572,14 @@ def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | N
     return curves
 
 
-def _colours(runs: xr.Dataset) -> dict[str, str]:
+def _colours(*results: xr.Dataset) -> dict[str, str]:
     """Returns the colour of each label: that of its first run's controller, or another shade of it."""
-    labels = [str(label) for label in runs["label"].values]
-    controllers = runs["feedforward"].values if "feedforward" in runs.coords else labels
-    first = dict(zip(reversed(labels), reversed([str(name) for name in controllers]), strict=True))
-    order = list(dict.fromkeys(labels))
-    return dict(zip(order, colours_of(first[label] for label in order), strict=True))
+    first: dict[str, str] = {}
+    for runs in results:
+        controllers = runs["feedforward" if "feedforward" in runs.coords else "label"].values
+        for label, controller in zip(runs["label"].values, controllers, strict=True):
+            first.setdefault(str(label), str(controller))
+    return dict(zip(first, colours_of(first.values()), strict=True))
 
 
 def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> xr.Dataset:

@@ -96,6 +96,11 @@ def test_colours():
     for labels in (("none", "fel"), ("fel", "none")):
         lines = plots.learning_curve(make(labels), ["v_rmse"]).axes[0].lines
         assert lines[labels.index("none")].get_color() == alone
+        by_case = plots.laps_by_case({"one": metrics.per_lap(make(labels))}, "v_rmse")
+        shares = plots.distributions(dict.fromkeys(labels, np.array([1.0, 2.0])), "ratio")
+        for figure in (by_case, shares):
+            entries = [line.get_color() for line in figure.legends[0].get_lines()]
+            assert entries == [line.get_color() for line in figure.axes[0].lines[:2]] == colours_of(labels)
     both = plots.compare_errors(make().isel(run=[0]), make().isel(run=[1])).axes[0].lines
     assert alone in {line.get_color() for line in both}
     (pid, net, own, again) = looks("abcd", ["none", "fel", "mine", "none"])
