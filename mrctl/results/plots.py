@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
+from matplotlib.patheffects import withStroke
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 from numpy.typing import NDArray
@@ -468,7 +469,7 @@ class InverseMap(NamedTuple):
 def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
     """Draws heat maps of the inverse dynamics over the twist, a row for each learner: true, learned, and error, in V.
 
-    The white line shows where the robot drove while it learned.
+    The white line, with a dark edge because an error of zero is white, shows where the robot drove while it learned.
 
     Raises:
         InputError: There is no map.
@@ -477,6 +478,7 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
         raise InputError("maps: at least one is needed")
     figure, axes = _figure(PAGE_WIDTH, (0.1 + 0.36 * len(maps)) * PAGE_WIDTH, rows=len(maps), columns=6, sharey=True)
     true = np.stack([one.true for one in maps.values()])
+    edge = [withStroke(linewidth=1.5, foreground="0.3")]
     for row, (name, one) in enumerate(maps.items()):
         for channel, symbol in enumerate((r"\Sigma", r"\Delta")):
             bound = float(np.abs(true[..., channel]).max())
@@ -488,7 +490,7 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
                 limit = bound / (4 if what == "error" else 1)
                 look: dict[str, Any] = {"cmap": colours, "vmin": -limit, "vmax": limit, "rasterized": True}
                 image = panel.pcolormesh(one.v, one.omega, values, **look)
-                panel.plot(*one.path.T, color="white", lw=0.5)
+                panel.plot(*one.path.T, color="white", lw=0.7, path_effects=edge)
                 panel.grid(False)
                 panel.set(xlim=one.v[[0, -1]], ylim=one.omega[[0, -1]])
                 if row == 0:

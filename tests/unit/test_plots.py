@@ -452,6 +452,19 @@ def test_inverse_dynamics():
     assert all(axes.get_xlabel() == "$V$ (m/s)" for axes in figure.axes[:6])
 
 
+def test_the_way_is_seen_where_there_is_no_error():
+    """An error of zero is white, as the line of where the robot drove."""
+    v, omega, true = np.linspace(0, 1, 4), np.linspace(-1, 1, 5), np.ones((5, 4, 2))
+    way = np.array([[0.2, -0.5], [0.8, 0.5]])
+    figure = plots.inverse_dynamics({"fel": plots.InverseMap(v, omega, true, true, way)})
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    panel = figure.axes[2]
+    (left, low), (right, high) = panel.transData.transform(way).astype(int)
+    picture = np.asarray(canvas.buffer_rgba())[::-1, :, :3]
+    assert picture[low:high, left:right].min() < 150
+
+
 def test_save(tmp_path):
     """PNG and PDF are written into a new folder; the PNG is not blank, and 180 mm at 200 dpi."""
     png, pdf = plots.save(drawings.control_structure(), tmp_path / "new" / "folder", "figure3")
