@@ -260,14 +260,15 @@ class Plots:
 def legend(robots: Sequence[Look], own_references: bool) -> str:
     """Returns the legend of robots and their colours in HTML; `own_references` is as in `charts`."""
     whole = "display:inline-block;color:rgb"  # a line ends between keys
-    keys = [f'<span style="{whole}{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
+    keys = []
+    if len(robots) > MAX_ROBOTS:  # first, because a long legend is cut off
+        keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]
+    keys += [f'<span style="{whole}{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
     keys += [f'<span style="{whole}{REFERENCE_COLOUR}">■ reference</span>']
     keys += ["V, θ̇: reference of each robot dashed."] * own_references
     keys += [f'<span style="{whole}{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
     keys += ["Time in s."]
-    if len(robots) > MAX_ROBOTS:
-        keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]
-    return f'<p style="margin:0.3em 1em;max-height:6em;overflow:auto">{" &nbsp; ".join(keys)}</p>'
+    return f'<p style="margin:0.3em 1em;max-height:9em;overflow:auto">{" &nbsp; ".join(keys)}</p>'
 
 
 def _series(chart: Chart) -> tuple[uplot.Series, ...]:

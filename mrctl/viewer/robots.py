@@ -200,7 +200,7 @@ class Robots:
         self._show_labels()
 
     def _show_labels(self) -> None:
-        """Moves the labels; robots that are close together have one label, a line for each of at most three of them."""
+        """Moves the labels; robots that are close together have one label, of at most three lines."""
         here, near = self.positions, {}
         for row in range(len(self._labels)):
             first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < LABEL_DISTANCE * self.length), row)
@@ -209,9 +209,9 @@ class Robots:
             label.visible = row in near
             if row in near:
                 names = near[row]
-                more = f" + {len(names) - 2}" if len(names) > 3 else ""
-                text = "\n".join(names[: 2 if more else 3]) + more  # in one line they are cut off at an edge
-                label.text = text
+                if len(names) > 3:
+                    names = [*names[:2], f"and {len(names) - 2} more"]
+                label.text = "\n".join(names)  # in one line they are cut off at an edge
                 label.position = here[row] + [0, 0, self.top - self._radius + LABEL_HEIGHT * self.length]
 
     def show_payload(self, row: int, perturbation: Perturbation) -> None:

@@ -429,10 +429,10 @@ def test_many_robots(browser, tmp_path):
         live.ask(live._command, "pause")
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
         text = page.inner_text("body")
-        assert "Curves are of the first 4 of 6 robots." in text
+        assert -1 < text.find("Curves are of the first 4 of 6 robots.") < text.find("■ seed 0")  # not cut off
         assert all(f"seed {k}" in page.inner_text("#mrctl-score") for k in range(6))
         assert len(curves(page, "position error, mm")[0]) == 1 + 4 + 1  # the time, the robots and the marks of events
-        assert [label.text for label in live._scene.robots._labels if label.visible] == ["seed 0\nseed 1 + 4"]
+        assert [label.text for label in live._scene.robots._labels if label.visible] == ["seed 0\nseed 1\nand 4 more"]
         time = np.linspace(0, 2, 50)
         values = [np.linspace(0, 1.9 * 10.0**k, 50) for k in range(4)]  # mm, up to 1,900
         live.ask(setattr, live._plots._handles[0], "data", (time, *values, np.full(50, -1.0)))
