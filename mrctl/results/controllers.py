@@ -22,7 +22,7 @@ CONTROLLERS: dict[str, tuple[str, str]] = {
     "model+l1": ("PID + model + L1", "#65A30D"),
     "true_model": ("PID + true model", "#475569"),
     "composite": ("PID + composite", "#00664B"),
-    "rls": ("PID + RLS", "#0D2B7F"),
+    "rls": ("PID + RLS", "#219DA6"),
     "mrac": ("PID + MRAC", "#5B21B6"),
 }
 
