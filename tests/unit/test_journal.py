@@ -41,7 +41,7 @@ def test_killed_while_it_opens(tmp_path, monkeypatch):
     file = tmp_path / "results.jsonl"
     Journal(file, {"seed": 1})["key"] = 2.5
 
-    def torn(path, text):
+    def torn(path, text, *_):
         with path.open("w") as opened:
             opened.write(text[:5])
         raise KeyboardInterrupt
