@@ -130,9 +130,12 @@ class Episodes:
             threads: Number of threads of the batch engine; 0 for all cores.
 
         Raises:
-            InputError: As `simulate`; or the action is unknown, or the scenarios cannot run together.
+            InputError: As `simulate`; or the action is unknown, `draw` is no function, or the scenarios cannot run
+                together.
         """
         first = scenarios[0]
+        if draw is not None and not callable(draw):
+            raise InputError("draw: must be a function of a random generator, such as mrctl.PERTURBATIONS['all'].drawn")
         if action not in ACTION_KINDS:
             raise InputError(f"action: {action!r} is not {', '.join(ACTION_KINDS)}")
         if len(scenarios) > 1 and first.motion_period != first.control_period:

@@ -299,6 +299,12 @@ def test_bad_options(options, message):
     assert np.array_equal(env.reset(seed=1)[0], TrackingVectorEnv(2, SHORT, threads=1).reset(seed=1)[0])
 
 
+def test_bad_draw():
+    """A name in the place of a function that draws is refused with an example of one."""
+    with pytest.raises(InputError, match=r"^draw: must be a function of a random generator, such as mrctl\.PERT"):
+        TrackingEnv(SHORT, draw="all")
+
+
 @pytest.mark.parametrize("action", ACTION_KINDS)
 def test_vector_is_single(action):
     """Under any actions the vector environment is Gymnasium's own vector of single ones, autoreset and all."""
