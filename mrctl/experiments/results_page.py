@@ -48,7 +48,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "reproduce": ("reproduce --out reproduction",),
     "suite": ("suite --out suite",),
     "random": ("suite --full --feedforward none fel true_model model+composite --seeds 4 --random 1000 --out worlds",),
-    "held_out": ("suite --held-out model+composite model+mrac model+rls model+fel --out held_out",),
+    "held_out": ("suite --held-out model+composite model+mrac model+rls model+fel model+l1 model+indi --out held_out",),
     "tune": (
         *(f"tune {robot} --delay 0 0.01 0.02 --out tune/{robot}" for robot in ROBOTS),
         "tune --time-constant 0.15 --delay 0 0.02 0.04 --out tune/imc",
