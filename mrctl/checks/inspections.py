@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mrctl.checks.open_loop import Car, caster_gaps, is_steered, rolling_wheels
+from mrctl.checks.open_loop import Car, caster_gaps, is_steered, rolling_fronts, rolling_wheels
 from mrctl.kernel import Array
-from mrctl.physics.elements import MOTORS, REAR, bodies_of, fronts, knuckles, part
+from mrctl.physics.elements import MOTORS, PREFIX, REAR, bodies_of, fronts, knuckles, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import (
@@ -188,6 +188,26 @@ def _casters(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
         if abs(gap) > 1e-2 * robot.wheel_radius
     }
     return _suspect("caster off the floor", odd, "correct its height or its size, or the height of the axle", move)
+
+
+def _swivels(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    def swivel_of(wheel: str) -> int | None:
+        """Returns the joint that turns the body that carries a caster's wheel; None if there is none."""
+        body = model.body_parentid[model.geom(wheel).bodyid[0]]
+        joint = model.body_jntadr[body]
+        return None if body == model.body("chassis").id or joint < 0 else int(joint)
+
+    def hold(m: mujoco.MjModel, wheel: Part) -> list[Assignment]:
+        dof, pairs = m.jnt_dofadr[swivels[wheel]], [pair for pair, tyre in _tyres(m).items() if tyre == wheel]
+        return [(m.dof_damping[dof : dof + 1], 1e3), *((m.pair_dim[pair : pair + 1], 1) for pair in pairs)]
+
+    if is_steered(model):
+        return None
+    swivels = {wheel: joint for wheel in rolling_fronts(model) if (joint := swivel_of(wheel)) is not None}
+    names = {wheel: model.joint(joint).name.removeprefix(PREFIX) for wheel, joint in swivels.items()}
+    odd = {wheel: f"joint {name} lets the fork of {wheel} swing" for wheel, name in names.items()}
+    advice = "the equations do not know how it pushes the robot aside as it swings out; a sphere slides instead"
+    return _suspect("swivelling caster", odd, advice, hold)
 
 
 def _radii(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
@@ -638,7 +658,7 @@ def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 INSPECTIONS = (
-    _edges, _centres, _axles, _places, _heights, _casters, _radii,
+    _edges, _centres, _axles, _places, _heights, _casters, _swivels, _radii,
     _motors, _armature, _constant, _gear, _grip_of_limits, _drag, _held_wheels, _losses, _creep,
     _wheel_masses, _balance, _tipping, _wheel_inertia, _gravity, _weightless,
     _missing_contacts, _other_contacts, _condim, _grip, _short_contacts, _soft_contacts,

@@ -180,6 +180,9 @@ KNUCKLE = '<default class="knuckle"><joint'
 AXLE, HELD = '<joint axis="0 1 0"', ' range="-9 9" stiffness="1" actuatorfrcrange="-0.3 0.3"'
 LIFTED = '<body gravcomp="1"><geom size="0.01" mass="0.1"/></body>'
 LEFT = 'name="wheel_left_joint"/>\n        <inertial pos="0 0 0" mass="0.12" diaginertia="4.1e-5 {}e-5 4.1e-5"'
+CASTER = '<geom name="caster_front" type="sphere" size="0.0176" pos="0.115 0 -0.0174" material="nylon"/>'
+FORK = """<body pos="0.13 0 0"><joint name="swivel" axis="0 0 1"/><geom size="0.02" mass="0.3" contype="0"
+  conaffinity="0"/><body pos="-0.015 0 -0.0174"><joint axis="0 1 0"/><geom size="0.0176" mass="0.1"/></body></body>"""
 ADOPTED = {
     "turtlebot": ('armature="7e-7"', "", "motors", "missing armature"),
     "turtlebot ice": ('friction="0.8"', 'friction="0.04"', "turning_limits", "limits beyond the grip"),
@@ -187,6 +190,7 @@ ADOPTED = {
     "turtlebot tips at full voltage": ('pos="0.0312 0 0.105"', 'pos="0.01 0 0.105"', "traction", "tips over"),
     "turtlebot held": (AXLE, AXLE + HELD, "limits", "wheel held by its joint"),
     "turtlebot wheel": (LEFT.format(7.4), LEFT.format(8), "mirror", "left and right wheels differ"),
+    "turtlebot swivel": (CASTER, FORK, "centre_of_mass", "swivelling caster"),
     "turtlebot gravcomp": ("<freejoint/>", "<freejoint/>" + LIFTED, "rest", "weight carried from outside"),
     "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
     "racecar spring": (KNUCKLE, KNUCKLE + ' stiffness="1"', "circle", "spring at the steering"),
