@@ -274,22 +274,26 @@ def held_scenarios(result: xr.Dataset) -> list[dict[str, Any]]:
         numbers = np.atleast_1d(result["run"]).tolist()
         if foreign := set(numbers) - set(range(len(every))):
             raise InputError(f"run: {min(foreign)} is the number of none of the {len(every)} scenarios in the result")
-        places = dict[int, int]()
-        for place, run in enumerate(numbers):
-            if (first := places.setdefault(run, place)) < place and not _same(result, first, place):
-                raise InputError(
-                    f"run: {run} is the number of two different runs, as after xr.concat, which keeps the scenarios of "
-                    "one result alone; simulate drives all scenarios in one call"
-                )
+        if not unique_runs(result):
+            raise InputError(
+                "run: two different runs have one number, as after xr.concat, which keeps the scenarios of one result "
+                "alone; simulate drives all scenarios in one call"
+            )
         return [every[run] for run in numbers]
     if len(every) != result.sizes.get("run", 1):
         raise InputError("run: the selection has lost the number of its run; select it without drop=True")
     return every
 
 
-def _same(result: xr.Dataset, one: int, other: int) -> bool:
-    """Tells whether two places of a result hold the same run, as a selection with repetition does."""
-    return result.isel(run=one).equals(result.isel(run=other))
+def unique_runs(result: xr.Dataset) -> bool:
+    """Tells whether runs with the same number are the same run, as in a selection with repetition."""
+    if "run" not in result.coords:
+        return True
+    places = dict[int, int]()
+    return all(
+        (first := places.setdefault(run, place)) == place or result.isel(run=first).equals(result.isel(run=place))
+        for place, run in enumerate(np.atleast_1d(result["run"]).tolist())
+    )
 
 
 def save(result: xr.Dataset, path: str | Path) -> None:

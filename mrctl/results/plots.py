@@ -30,7 +30,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
-from mrctl.results.dataset import check_kind, held_scenarios, scenarios_of
+from mrctl.results.dataset import check_kind, held_scenarios, scenarios_of, unique_runs
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap, shown_unit
 from mrctl.theory.obstacles import Obstacles, turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -622,8 +622,11 @@ def _laps(result: xr.Dataset, title: str) -> xr.Dataset:
 
 
 def _plant(*results: xr.Dataset) -> str:
-    """Names robot, perturbation and sensing tier of the runs, or says which differ; "" where they are not known."""
-    if any("scenarios" not in result.attrs for result in results):
+    """Names robot, perturbation and sensing tier of the runs, or says which differ; "" where they are not known.
+
+    They are not after `xr.concat` of two results, which keeps the scenarios of one alone.
+    """
+    if any("scenarios" not in result.attrs or not unique_runs(result) for result in results):
         return ""
     names = [(name, perturbation.model_dump(mode="json")) for name, perturbation in PERTURBATIONS.items()]
     found: dict[str, set[str]] = {"robots": set(), "perturbations": set(), "sensing tiers": set()}

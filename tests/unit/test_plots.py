@@ -131,6 +131,8 @@ def test_plant_is_named():
     both = "plant: different robots, different perturbations, lab"
     assert plots.path(result).legends[0].get_title().get_text() == both
     assert plots.compare_errors(result.isel(run=0), result.isel(run=1)).legends[0].get_title().get_text() == both
+    two = xr.concat([result, result.assign(lateral_error=result["lateral_error"] + 1)], "run")
+    assert plots.learning_curve(two).get_suptitle() == ""  # which has the scenarios of one alone
     with pytest.raises(InputError, match=r"^run: the selection has lost the number of its run; .*$"):
         plots.errors(result.isel(run=1, drop=True))
     with pytest.raises(InputError, match=r"^run: the selection has lost the number of its run; .*$"):

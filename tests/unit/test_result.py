@@ -162,7 +162,7 @@ def test_selection(result):
     refused(f"run: {count} is the number of none of the {count} scenarios in the result", scenarios_of, renumbered)
     assert scenarios_of(result.isel(run=[1, 0, 1])) == [SCENARIOS[1], SCENARIOS[0], SCENARIOS[1]]
     others = xr.concat([simulate(SCENARIOS[1]), simulate(SCENARIOS[0])], "run", join="outer")
-    refused("run: 0 is the number of two different runs, as after xr.concat", scenarios_of, others)
+    refused("run: two different runs have one number, as after xr.concat", scenarios_of, others)
 
 
 def test_result_of_an_older_version(result, tmp_path):
