@@ -40,7 +40,8 @@ class _Interrupts:
                 with contextlib.suppress(OSError):
                     sys.stdout.flush()
                 for program in begun:  # such as the one that glfw asks for a version, which would print a traceback
-                    program.kill()
+                    with contextlib.suppress(AttributeError, TypeError):  # one that is only about to begin
+                        program.kill()
                 print("mrctl: interrupted", file=sys.__stderr__, flush=True)  # sys.stderr may be captured just now
                 os._exit(130)
             frame = frame.f_back
