@@ -272,6 +272,12 @@ def test_no_stale_exclusion(pattern: str) -> None:
     assert any(re.fullmatch(pattern, command) for command in command_lines())
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name + "-" + page.stem)
+def test_items_begin_lines(page: Path) -> None:
+    """A numbered item within a line is no item but text; wrapping a list as one paragraph makes it so."""
+    assert not re.findall(r"\S \d\. \*\*.*", page.read_text())
+
+
 def links() -> list[tuple[Path, str]]:
     """Links in the prose of every page that point into the repository."""
     prose = {page: re.sub(r"`[^`\n]*`", "", FENCE.sub("", page.read_text())) for page in PAGES}
