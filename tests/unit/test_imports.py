@@ -419,6 +419,18 @@ def test_interrupt_of_a_program(wait: float) -> None:
     assert "Traceback" not in said
 
 
+def check_interrupted(command: str, folder: Path) -> None:
+    """Checks that `python -m mrctl` ends as interrupted, with one line, if its command is this expression."""
+    (folder / "sitecustomize.py").write_text(
+        "import os, signal, sys, types\n"
+        "sys.modules['mrctl.cli'] = cli = types.ModuleType('mrctl.cli')\n"
+        f"cli.main = lambda: {command}\n"
+    )
+    paths = os.environ | {"PYTHONPATH": str(folder)}
+    ended = subprocess.run([sys.executable, "-m", "mrctl"], env=paths, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (130, "mrctl: interrupted\n")
+
+
 ASKS = """
 import os, signal, sys, time
 from subprocess import PIPE, Popen
@@ -436,14 +448,7 @@ version()
 def test_interrupt_of_a_program_that_an_import_began(tmp_path: Path) -> None:
     """Ctrl-C while a library that is being imported asks a program of its own, as glfw does, gives one line too."""
     (tmp_path / "asks.py").write_text(ASKS)
-    (tmp_path / "sitecustomize.py").write_text(
-        "import sys, types\n"
-        "sys.modules['mrctl.cli'] = cli = types.ModuleType('mrctl.cli')\n"
-        "cli.main = lambda: __import__('asks')\n"
-    )
-    command, paths = [sys.executable, "-m", "mrctl"], os.environ | {"PYTHONPATH": str(tmp_path)}
-    ended = subprocess.run(command, env=paths, capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (130, "mrctl: interrupted\n")
+    check_interrupted("__import__('asks')", tmp_path)
 
 
 CALLED_BACK = """
@@ -473,11 +478,4 @@ def test_interrupt_of_a_string_of_code(tmp_path: Path) -> None:
 
     Python would end by the signal, which `subprocess` reports as −2.
     """
-    (tmp_path / "sitecustomize.py").write_text(
-        "import os, signal, sys, types\n"
-        "sys.modules['mrctl.cli'] = cli = types.ModuleType('mrctl.cli')\n"
-        "cli.main = lambda: exec('os.kill(os.getpid(), signal.SIGINT); [None for _ in range(10**6)]')\n"
-    )
-    command, paths = [sys.executable, "-m", "mrctl"], os.environ | {"PYTHONPATH": str(tmp_path)}
-    ended = subprocess.run(command, env=paths, capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (130, "mrctl: interrupted\n")
+    check_interrupted("exec('os.kill(os.getpid(), signal.SIGINT); [None for _ in range(10**6)]')", tmp_path)
