@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 from mrctl.kernel import Array
 from mrctl.record import InputError, Record
 from mrctl.theory.robot import Robot
-from mrctl.theory.spline import Plane, Spline, plane, spline
+from mrctl.theory.spline import KEPT, Plane, Spline, plane, spline
 from mrctl.theory.timing import LIMIT_SHARE, Limits, SmoothLaw, sample_path, smooth
 
 Length = Annotated[float, Field(ge=1e-3, le=1000)]
@@ -438,7 +438,7 @@ class Waypoints(Record):
         return along_path(*self._path.at(s), v, a)
 
 
-@lru_cache(maxsize=512)  # a comparison has hundreds of plans, whose scenarios ask for their durations repeatedly
+@lru_cache(maxsize=KEPT)
 def _time_law(
     points: tuple[tuple[float, float], ...],
     closed: bool,
@@ -505,7 +505,7 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
     _check(reference, robot, reverse)
 
 
-@lru_cache(1024)
+@lru_cache(KEPT)
 def _check(reference: Reference, robot: Robot, reverse: bool) -> None:
     if fault := _fault(reference, robot, reverse):
         raise InputError(f"reference {reference.kind}: {fault}{_remedy(reference, robot, reverse)}")

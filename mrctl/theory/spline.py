@@ -12,6 +12,9 @@ from mrctl.kernel import Array
 
 Plane = NDArray[np.complexfloating]
 
+KEPT = 2048
+"""Number of curves that are kept, with 40 kB each: sweeps and comparisons ask for each of theirs repeatedly."""
+
 # Gauss-Legendre quadrature on (0, 1) for the arc length of a piece, exact to rounding.
 _PIECE_NODES, _PIECE_WEIGHTS = (np.polynomial.legendre.leggauss(6) + np.array([[1], [0]])) / 2
 
@@ -120,5 +123,5 @@ class Spline:
         return p, heading + lap * (self.heading[-1] - self.heading[0]), log.imag / step, sharpness
 
 
-spline = lru_cache(maxsize=512)(Spline)
-"""The spline through points, as `Spline` makes it; the 512 used last are kept."""
+spline = lru_cache(maxsize=KEPT)(Spline)
+"""The spline through points, as `Spline` makes it; the `KEPT` used last are kept."""
