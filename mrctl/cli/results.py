@@ -94,8 +94,8 @@ def record(
     Args:
         file: Result of `mrctl run --out` or `mrctl sweep`.
         out: File to write, whose name ends in .gif, or in .mp4, which needs pip install 'mrctl[video]'.
-        number: Number of the run to show; by default up to four runs are shown together, the first one solid and the
-            others as ghosts, and of more runs only the first one.
+        number: Number of the run to show; by default up to four runs are shown together, the first one solid and those
+            of its world as ghosts, and of more runs only the first one.
         code: Whether a sweep may run the Python files of the controller that it names.
     """
     check_exists(file)
@@ -103,8 +103,8 @@ def record(
         os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported
     from mrctl.viewer import video
 
-    video.record(file, number, out, code)
-    print(f"video: {out}")
+    left_out = video.record(file, number, out, code)
+    print(f"video: {out}" + (f" ({left_out})" if left_out else ""))
 
 
 def export(

@@ -46,7 +46,7 @@ PALETTE_METHOD = Image.Quantize.FASTOCTREE
 TRAIL_WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
 
 
-def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
+def record(folder: Path, run: int | None, out: Path, code: bool = True) -> str:
     """Writes a video of a result: the first run solid, the others as ghosts, with the reference and their trails.
 
     Args:
@@ -54,6 +54,9 @@ def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
         run: Number of the one run to show; by default those that `mrctl view` shows first.
         out: File to write, whose name ends in `.mp4` or `.gif`; MP4 needs the extra `video`.
         code: Whether a sweep may run the Python files that it names.
+
+    Returns:
+        A sentence on the runs that the video leaves out, or "".
 
     Raises:
         InputError: The file exists, has another ending or cannot be written; there is no such run; MuJoCo cannot draw
@@ -78,6 +81,10 @@ def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
         (_write_gif if out.suffix == ".gif" else _write_mp4)(progress, out)
     except OSError as error:
         raise InputError(f"out: {out}: {error.strerror or error}") from None
+    if run is not None or len(shown) == len(library.table):
+        return ""
+    numbers = ", ".join(map(str, shown))
+    return f"run{'s' * (len(shown) > 1)} {numbers}, {len(shown)} of {len(library.table)}; --run chooses another"
 
 
 def _write_gif(pictures: Iterable[Picture], out: Path) -> None:

@@ -312,9 +312,10 @@ def _random_value(handle, rng):
 
 def test_record(tmp_path, capsys):
     """GIF and MP4 of a result show the robot on its way; where MuJoCo cannot draw, one line says so."""
-    result, driven = tmp_path / "result.zarr", simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")])
-    save(driven.isel(time=slice(0, 50)), result)  # half a second of it
-    save(driven.isel(time=slice(0, 1)), tmp_path / "sample.zarr")
+    result, scenario = tmp_path / "result.zarr", Scenario(reference=Line(length=0.8), laps=1, learner="none")
+    driven = simulate([scenario, scenario.replace(world="patch")])
+    save(driven.isel(run=[0], time=slice(0, 50)), result)  # half a second of it
+    save(driven.isel(time=slice(0, 1)), tmp_path / "sample.zarr")  # of two runs that share no scene
     gif, mp4 = (["record", str(result), "--out", str(tmp_path / name)] for name in ("run.gif", "run.mp4"))
     one = ["record", str(tmp_path / "sample.zarr"), "--out", str(tmp_path / "one.gif")]
     few = "from mrctl.viewer import video; video.RATES['.mp4'] = 5.0"  # pictures a second, for they take long to draw
@@ -333,6 +334,7 @@ def test_record(tmp_path, capsys):
             assert (np.abs(last - own.colour).max(axis=-1) < 40).sum() > 100
         with Image.open(tmp_path / "one.gif") as video:
             assert (video.n_frames, video.size) == (1, (640, 360))  # of the one sample
+        assert "run.gif\n" in done.stdout and "one.gif (run 0, 1 of 2; --run chooses another)\n" in done.stdout
         about, *pictures = imageio_ffmpeg.read_frames(tmp_path / "run.mp4")
         assert (about["size"], about["fps"], len(pictures)) == ((1280, 720), 5, 3)
         first, last = (np.frombuffer(pictures[k], np.uint8).reshape(-1, 3).astype(float) for k in (0, -1))
