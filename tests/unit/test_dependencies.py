@@ -11,6 +11,7 @@ import mrctl
 
 PACKAGE = Path(mrctl.__file__).parent
 PROJECT = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+README = (PACKAGE.parent / "README.md").read_text("utf-8")
 OPTIONAL = {  # file that alone may import a module of an extra
     "envs/gym.py": "env",
     "sweep/pool.py": "dask",
@@ -81,3 +82,10 @@ def test_walk(tmp_path: Path) -> None:
     assert names(["dm-control==1.0.50", "pyright[nodejs]>=1", "Typing_Extensions"]) == {
         "dm-control", "pyright", "typing-extensions",
     }  # fmt: skip
+
+
+def test_python_versions():
+    """README names the versions of Python with which all dependencies can be installed, as pip is told."""
+    first, after = map(int, re.fullmatch(r">=3\.(\d+),<3\.(\d+)", PROJECT["requires-python"]).groups())
+    (named,) = re.findall(r"needs Python (3\.\d+(?: or 3\.\d+)*)", README)
+    assert named.split(" or ") == [f"3.{k}" for k in range(first, after)]
