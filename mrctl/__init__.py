@@ -9,7 +9,7 @@ import os
 
 import lazy_loader
 
-if os.environ.get("MUJOCO_GL") == "egl":
+if os.environ.get("MUJOCO_GL") in ("egl", "osmesa"):
     # Where there is no GPU, Mesa draws. Triton, which torch with CUDA imports at the first optimizer, crashes the
     # process if it is loaded after Mesa, because both contain LLVM.
     with contextlib.suppress(ImportError):
