@@ -26,6 +26,7 @@ from mrctl.scenario import Scenario
 
 MAX_SMALL_BYTES = 2**30  # bytes of signals that any result may have
 MAX_EXPANSION = 1000  # bytes of signals that a larger result may have for each byte in its files
+MAX_ABOUT_BYTES = 2**30  # largest zarr.json in bytes; that of a result holds the scenarios, 3 kB or more for each run
 
 # Name: (unit, meaning). A sample at time t holds the state at t, the commands computed from it, and the currents and
 # power at the end of the control period that begins at t; the commands act after the delay.
@@ -349,7 +350,7 @@ def _checksums(folder: Path) -> dict[str, str]:
     """
     found = {}
     for file in sorted([folder / "zarr.json", *folder.glob("*/zarr.json")]):
-        about = json.loads(read_file(file))
+        about = json.loads(read_file(file, MAX_ABOUT_BYTES))
         if file.parent == folder:
             about["attributes"].pop(CHECKSUMS, None)
         found[file.relative_to(folder).as_posix()] = checksum(about)

@@ -244,6 +244,13 @@ def test_read_only(small, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_thousands_of_scenarios(small, tmp_path):
+    """They take more space than any file of settings may have."""
+    many = small.assign_attrs(scenarios=json.dumps(json.loads(small.attrs["scenarios"]) * 600))
+    save(many, tmp_path / "a")
+    assert open_result(tmp_path / "a").identical(many)
+
+
 def test_disk_full(small, tmp_path, monkeypatch):
     """Nothing is left behind when writing fails in the middle."""
     write = xr.Dataset.to_zarr
