@@ -14,7 +14,7 @@ import json
 import uuid
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -36,6 +36,7 @@ Format = Literal["mcap", "csv", "parquet", "npz"]
 Columns = dict[str, NDArray]
 Message = dict[str, Any]
 
+READ_TOGETHER = 16  # number of runs; as many share a chunk of the signals of a sweep, which is read as a whole
 UNMEASURED = 1e6  # variance of what a sensor does not measure, as in diff_drive_controller of ros2_controllers
 
 # Message definitions of ROS 2, without their comments.
@@ -154,10 +155,7 @@ def _that_drove(whole: xr.Dataset) -> xr.Dataset:
     Raises:
         InputError: There is none.
     """
-    drove = np.zeros(whole.sizes["run"], bool)
-    for k, number in enumerate(whole["run"].values):
-        with reading(f"signals of run {int(number)}"):
-            drove[k] = np.isfinite(whole["x"].isel(run=k).values).any()
+    drove = np.array([np.isfinite(columns["x"]).any() for columns in _columns(whole, ["x"])], bool)
     idle = whole["run"].values[~drove].tolist()
     if not drove.any():
         reason = str(whole["failure"].values[0]) if idle and "failure" in whole else ""
@@ -169,13 +167,23 @@ def _that_drove(whole: xr.Dataset) -> xr.Dataset:
     return whole.isel(run=drove)
 
 
+def _columns(whole: xr.Dataset, names: Sequence[str]) -> Iterator[Columns]:
+    """Yields variables of each run, of which only `READ_TOGETHER` are in memory."""
+    numbers = whole["run"].values
+    for first in range(0, len(numbers), READ_TOGETHER):
+        rows = slice(first, first + READ_TOGETHER)
+        with reading(f"signals of run {int(numbers[first])} or one after it"):
+            several = [whole[name].transpose("run", ...)[rows].values for name in names]
+        for one in zip(*several, strict=True):
+            yield dict(zip(names, one, strict=True))
+
+
 def _runs(whole: xr.Dataset) -> Iterator[tuple[int, Columns]]:
-    """Yields number and signals of each run, with their times, until it ended; only one run at a time is in memory."""
-    for k, number in enumerate(whole["run"].values):
-        with reading(f"signals of run {int(number)}"):
-            one = whole.isel(run=k).load()
-        drove = np.isfinite(one["x"].values)
-        yield int(number), {name: one[name].values[drove] for name in ("time", *SIGNALS) if name in one}
+    """Yields number and signals of each run, with their times, until it ended."""
+    time, names = whole["time"].values, [name for name in SIGNALS if name in whole]
+    for number, columns in zip(whole["run"].values, _columns(whole, names), strict=True):
+        drove = np.isfinite(columns["x"])
+        yield int(number), {"time": time[drove]} | {name: values[drove] for name, values in columns.items()}
 
 
 def _unit(name: str) -> str:
@@ -184,18 +192,16 @@ def _unit(name: str) -> str:
 
 def _table(whole: xr.Dataset, several: bool) -> Iterator[pa.Table]:
     """Yields a table for each run, with units and meanings in its fields, and scenarios and versions in its schema."""
-    about = {name: str(value) for name, value in whole.attrs.items()}
+    kinds = (("run", pa.int64()), ("label", pa.string())) if several else ()
+    fields = [pa.field(name, kind, metadata={"units": "1"}) for name, kind in kinds]
+    for name in ("time", *(name for name in SIGNALS if name in whole)):
+        meaning = "time" if name == "time" else SIGNALS[name][1]
+        fields.append(pa.field(name, pa.float64(), metadata={"units": _unit(name), "long_name": meaning}))
+    # Made once, because it holds the scenarios of all runs.
+    schema = pa.schema(fields, metadata={name: str(value) for name, value in whole.attrs.items()})
     for label, (number, columns) in zip(np.atleast_1d(whole["label"]), _runs(whole), strict=True):
-        fields, arrays = list[pa.Field](), list[Any]()
-        if several:
-            kinds = ("run", pa.int64()), ("label", pa.string())
-            fields += [pa.field(name, kind, metadata={"units": "1"}) for name, kind in kinds]
-            arrays += [[value] * len(columns["time"]) for value in (number, str(label))]
-        for name, values in columns.items():
-            meaning = "time" if name == "time" else SIGNALS[name][1]
-            fields.append(pa.field(name, pa.float64(), metadata={"units": _unit(name), "long_name": meaning}))
-            arrays.append(values)
-        yield pa.table(arrays, schema=pa.schema(fields, metadata=about))
+        whose = [[value] * len(columns["time"]) for value in (number, str(label))] if several else []
+        yield pa.table([*whose, *columns.values()], schema=schema)
 
 
 def _parquet(whole: xr.Dataset, several: bool, path: Path) -> None:
