@@ -410,11 +410,13 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
         runs, `attrs["units"]` the units by column.
 
     Raises:
-        InputError: No run has that lap.
+        InputError: There is no run, or none has that lap.
     """
     check_kind(result)
     laps = as_runs(result) if "lap" in result.dims else per_lap(result)
     counts = laps["laps"].values
+    if not len(counts):
+        raise InputError("result: holds no run")
     index = np.where(lap > 0, lap - 1, counts + lap)
     there = (index >= 0) & (index < counts)
     if lap == 0 or not there.any():

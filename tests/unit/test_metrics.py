@@ -309,6 +309,7 @@ def test_recovery_laps():
         (lambda r: metrics.per_lap(r.sel(time=slice(90, 91))), "result"),
         (lambda r: metrics.summary(r, lap=0), "lap"),
         (lambda r: metrics.summary(r, lap=9), "lap"),
+        (lambda r: metrics.summary(r.isel(run=[])), "result"),
         (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "speed"), "metric"),
         (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "v_rmse", 0.5), "factor"),
         (lambda _: metrics.summary(3), "result"),  # type: ignore[arg-type]
