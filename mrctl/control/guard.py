@@ -79,8 +79,8 @@ NO_RESET_FACTOR = 0.1  # further factor on the learning gain of a stage that can
 
 @kernel
 def guard(
-    g: Row, feedforward: Array, nominal: Array, error: Array, command: Array, twist: Array, voltage: Array,
-    period: float, rigid: bool, integral: Array, feedback: Array,
+    g: Row, feedforward: Array, nominal: Array, posture_error: Array, voltage: Array, period: float, rigid: bool,
+    pid: Row, feedback: Array,
 ) -> None:  # fmt: skip
     """One tick of the guard of one robot, between the feedforward stage and the allocation.
 
@@ -91,77 +91,95 @@ def guard(
       after a longer hold. Its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest is
       the fallback's. After `retries` the fallback stays.
 
-        output = fallback + authority (learner − fallback) + bump
-
     Args:
         g: In and out: a record of `GUARD`, whose `output`, `teaching`, `frozen` and `forget` are the result.
         feedforward: Output of the feedforward stage in V (rad/s on a steering channel), `(2,)`.
         nominal: Output of the nominal inverse dynamics in the same units, `(2,)`.
-        error: Posture error in m, m, rad, `(3,)`.
-        command: Commanded V and θ̇ in m/s and rad/s, `(2,)`.
-        twist: Estimated V and θ̇ in the same units, `(2,)`.
+        posture_error: Posture error in m, m, rad, `(3,)`.
         voltage: Voltage of the last tick in the two channels, after the limits, `(2,)`.
         period: Control period in s.
         rigid: Whether the second channel is steering.
-        integral: In and out: integrals of the PID, `(2,)`.
+        pid: In and out: a record of `PID`, whose `error` is that of V and θ̇, and whose `integral` takes over.
         feedback: In and out: output of the PID, `(2,)`.
     """
     g.forget = False
-    if not g.on:
-        for k in range(2):
-            g.output[k], g.teaching[k] = feedforward[k], g.gain * feedback[k]
-        return
-    broken, g.broken = g.broken, False
+    if g.on:
+        limit_learner(g, feedforward, rigid)
+        mix(g, nominal, voltage, feedback, period)
+        trouble = worst_trouble(g, posture_error, pid.error)
+        g.broken = False
+        g.hold_left -= period
+        if g.action != FALLBACK and trouble > 0:
+            fall_back(g, trouble, nominal, pid.integral, feedback)
+        elif trouble > 0:
+            g.hold_left = max(g.hold_left, g.hold)
+        elif g.hold_left <= 0:
+            g.action, g.reason = NONE, 0.0
+        if g.action != FALLBACK:
+            g.authority = min(1.0, g.authority + period * g.gain / RESUME_TIME)
+        g.frozen = g.action == FALLBACK
     for k in range(2):
-        broken |= not np.isfinite(feedforward[k])
-    if not broken:  # otherwise `limited` keeps its last values, from which the fallback starts
-        for k in range(2):  # as the voltage of each motor is limited; U_r,l = U_Σ ± U_Δ
-            demand = abs(feedforward[k]) if rigid else abs(feedforward[0]) + abs(feedforward[1])
-            g.limited[k] = feedforward[k] * (g.range[k] / max(g.range[k], demand))
-    for k in range(2):
-        fallback = nominal[k] if g.model else 0.0
-        deviation = g.authority * (g.limited[k] - fallback)
-        wave = swing(feedback[k], k, period, g.feedback)
-        count_half_waves(wave, k, g.oscillation * g.harmless[k], MAX_HALF_WAVE, period, g.half_waves)
-        g.output[k] = g.limited[k]
-        if g.authority < 1.0:
-            g.bump[k] *= g.fade / (g.fade + period)
-            g.output[k] = fallback + deviation + g.bump[k]
-        g.handed[k] *= PEAK_DECAY / (PEAK_DECAY + period)
-        g.deviation[k] = max(abs(deviation), abs(g.handed[k]), PEAK_DECAY / (PEAK_DECAY + period) * g.deviation[k])
-        g.model_error[k] += period / (AVERAGING_TIME + period) * (voltage[k] - nominal[k] - g.model_error[k])
-    trouble = worst_trouble(g, broken, error, command, twist)
-
-    g.hold_left -= period
-    if g.action != FALLBACK and trouble > 0:
-        fall_back(g, trouble, nominal, integral, feedback)
-    elif trouble > 0:
-        g.hold_left = max(g.hold_left, g.hold)
-    elif g.hold_left <= 0:
-        g.action, g.reason = NONE, 0.0
-
-    if g.action != FALLBACK:
-        g.authority = min(1.0, g.authority + period * g.gain / RESUME_TIME)
-    g.frozen = g.action == FALLBACK
-    for k in range(2):
+        if not g.on:
+            g.output[k] = feedforward[k]
         g.teaching[k] = g.gain * feedback[k]
 
 
 @kernel
-def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Array) -> int:
+def limit_learner(g: Row, feedforward: Array, rigid: bool) -> None:
+    """Limits the output of the learner to the supply, as the voltage of each motor is limited: U_r,l = U_Σ ± U_Δ.
+
+    Of one that is not finite `limited` keeps its last values, from which the fallback starts.
+    """
+    g.beyond = False
+    for k in range(2):
+        if not np.isfinite(feedforward[k]):
+            g.broken = True
+    for k in range(2):
+        demand = abs(feedforward[k]) if rigid else abs(feedforward[0]) + abs(feedforward[1])
+        if demand > g.range[k]:
+            g.beyond = True
+        if not g.broken:
+            g.limited[k] = feedforward[k] * (g.range[k] / max(g.range[k], demand))
+
+
+@kernel
+def mix(g: Row, nominal: Array, voltage: Array, feedback: Array, period: float) -> None:
+    """Mixes the learner with the fallback, and measures what `worst_trouble` compares with bounds.
+
+        output = fallback + authority (learner − fallback) + bump
+
+    The bump is the step in voltage at the beginning of a fallback, as far as it has not faded yet.
+    """
+    decay = PEAK_DECAY / (PEAK_DECAY + period)
+    for k in range(2):
+        fallback = nominal[k] if g.model else 0.0
+        deviation = g.authority * (g.limited[k] - fallback)
+        g.output[k] = g.limited[k]
+        if g.authority < 1.0:
+            g.bump[k] *= g.fade / (g.fade + period)
+            g.output[k] = fallback + deviation + g.bump[k]
+        wave = swing(feedback[k], k, period, g.feedback)
+        count_half_waves(wave, k, g.oscillation * g.harmless[k], MAX_HALF_WAVE, period, g.half_waves)
+        g.handed[k] *= decay
+        g.deviation[k] = max(abs(deviation), abs(g.handed[k]), decay * g.deviation[k])
+        g.model_error[k] += period / (AVERAGING_TIME + period) * (voltage[k] - nominal[k] - g.model_error[k])
+
+
+@kernel
+def worst_trouble(g: Row, posture_error: Array, velocity_error: Array) -> int:
     """Returns the reason of the worst trouble now, an index into `REASONS`; 0 if nothing is wrong.
 
     While the learner acts, trouble counts only if the learner deviated so far that it may have caused it.
     """
-    posture = np.hypot(np.hypot(error[0], error[1]), HEADING_ARM * error[2])
+    posture = np.hypot(np.hypot(posture_error[0], posture_error[1]), HEADING_ARM * posture_error[2])
     g.nearest = min(g.nearest, posture)
-    if broken:
+    if g.broken:
         return BROKEN
     for k in range(2):
         deviation = np.inf if g.action == FALLBACK else g.deviation[k]
         if deviation > g.harmless_to_posture[k] and posture > max(TOLERATED_POSTURE, g.growth * g.nearest):
             return FAR
-        if deviation > g.harmless[k] and abs(command[k] - twist[k]) > g.region[k]:
+        if deviation > g.harmless[k] and abs(velocity_error[k]) > g.region[k]:
             return FAST
         if deviation > g.oscillation * g.harmless[k] and g.half_waves.count[k] >= SUSTAINED_HALF_WAVES:
             return OSCILLATION
@@ -253,7 +271,8 @@ GUARD = np.dtype(
         ("gain", "f8"),  # factor on the feedback that the learner is taught with
         ("authority", "f8"),  # share of the learner in the output; the rest is the fallback's
         ("bump", "f8", 2),  # step in voltage at the beginning of a fallback, as far as it has not faded yet, V (rad/s)
-        ("broken", "?"),  # whether the learner itself is not finite, as its caller found
+        ("broken", "?"),  # whether the learner is not finite, as the guard or its caller has found
+        ("beyond", "?"),  # whether the learner asks for more than `range`
         ("forget", "?"),  # whether the learner is to be reset to its initial weights
         ("frozen", "?"),  # whether the learner must not learn now
         ("limited", "f8", 2),  # output of the learner, limited to the supply, V (rad/s)

@@ -89,16 +89,12 @@ def command_motion(reference: Row, robot: Row, period: float, s: Row) -> None:
 
 
 @kernel
-def watch(seen: Row, model: Row, robot: Row, period: float, s: Row) -> None:
+def watch(model: Row, robot: Row, period: float, s: Row) -> None:
     """The watch on the velocity loop, and the guard, which limits the feedforward or replaces it."""
-    command, derivative = s.limiter.command, s.limiter.derivative
     if s.guard.on or s.delay.on:
-        prior_voltage(command, derivative, model, s.nominal)
+        prior_voltage(s.limiter.command, s.limiter.derivative, model, s.nominal)
     watch_delay(s.feedback, s.guard.output, s.nominal, period, s.delay)
-    guard(
-        s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.voltage, period, robot.rigid, s.pid.integral,
-        s.feedback,
-    )  # fmt: skip
+    guard(s.guard, s.feedforward, s.nominal, s.error, s.voltage, period, robot.rigid, s.pid, s.feedback)
 
 
 @kernel
@@ -160,7 +156,7 @@ def update(moves: bool, seen: Rows, reference: Rows, period: float, place: int) 
         respond(i, command, derivative, robot[0], arrays, s.feedforward)
         for k in range(2):
             s.feedforward[k] += s.prior[k]
-        watch(measured, model[0], robot[0], period, s)
+        watch(model[0], robot[0], period, s)
         steer(command, derivative, s.feedback, s.guard.output, period, robot[0], s.allocation)
         finite &= apply_voltages(measured, robot[0], period, s)
         shown = Shown(command, derivative, s.guard.teaching, s.frozen, measured.twist, s.voltage, period)

@@ -13,15 +13,7 @@ MAX_LATERAL_ERROR = 1.0  # m of lateral error, beyond which a run has failed
 
 
 @kernel
-def beyond(feedforward: Array, limits: Array, rigid: bool) -> bool:
-    """Returns whether the two channels ask for more than their limits; U_r,l = U_Σ ± U_Δ unless one is steering."""
-    if rigid:
-        return abs(feedforward[0]) > limits[0] or abs(feedforward[1]) > limits[1]
-    return abs(feedforward[0]) + abs(feedforward[1]) > limits[0]
-
-
-@kernel
-def record(plant: Rows, seen: Rows, reference: Rows, control: Rows, rigid: bool, error: Array, ticks: Rows) -> bool:
+def record(plant: Rows, seen: Rows, reference: Rows, control: Rows, error: Array, ticks: Rows) -> bool:
     """Writes the signals of one control tick of all robots; returns whether all that go on are near their references.
 
     A sample at time t has the state at t, the commands computed from it, and the currents and the power at the end of
@@ -32,7 +24,6 @@ def record(plant: Rows, seen: Rows, reference: Rows, control: Rows, rigid: bool,
         seen: Record of `SEEN` of each robot.
         reference: Record of `REFERENCE` of each robot.
         control: Record of `CONTROL` of each robot.
-        rigid: Whether the second channel is steering.
         error: Scratch, `(3,)`.
         ticks: Out: record of `TICK` of each robot.
     """
@@ -67,7 +58,7 @@ def record(plant: Rows, seen: Rows, reference: Rows, control: Rows, rigid: bool,
         t.power = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
         t.guard, t.guard_reason, t.retunes = c.guard.action, c.guard.reason, c.delay.moves
         t.z, t.roll_angle, t.pitch_angle = state.z, state.roll, state.pitch
-        t.feedforward_limited = 1.0 if c.guard.on and beyond(c.feedforward, c.guard.range, rigid) else 0.0
+        t.feedforward_limited = 1.0 if c.guard.beyond else 0.0
         t.motor_voltage_left, t.motor_voltage_right = p.applied[0], p.applied[1]
         near &= not abs(t.lateral_error) > MAX_LATERAL_ERROR or p.stopped
     return near
@@ -82,12 +73,12 @@ class Log:
         near: Whether in that tick all robots that had not failed were within `MAX_LATERAL_ERROR` of their references.
     """
 
-    def __init__(self, length: int, size: int, rigid: bool) -> None:
-        """Takes the number of ticks to keep, the number of robots, and whether the second channel is steering."""
+    def __init__(self, length: int, size: int) -> None:
+        """Takes the number of ticks to keep, and the number of robots."""
         # The records of a tick lie side by side, so that the loop writes one block of memory for any number of robots.
         self.ticks = np.empty((length, size), TICK)
         self.now, self.near = self.ticks[0], True
-        self._rigid, self._error = rigid, np.zeros(3)
+        self._error = np.zeros(3)
         self._record = record.repeated()
 
     def at(self, tick: int) -> Rows:
@@ -102,4 +93,4 @@ class Log:
     def record(self, tick: int, plant: Rows, seen: Rows, reference: Rows, control: Rows) -> None:
         """Records a tick; the arguments are those of the kernel `record`."""
         self.now = self.at(tick)
-        self.near = self._record(plant, seen, reference, control, self._rigid, self._error, self.now)
+        self.near = self._record(plant, seen, reference, control, self._error, self.now)

@@ -90,7 +90,7 @@ class Simulation:
         self.sensors = Sensors([s.sensing for s in scenarios], [s.seed for s in scenarios], self.period)
         self.estimator = self._build_estimator(users.get("estimator"))
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
-        self.log = Log(1 if restarting else self.ticks, size, self.hierarchy.rigid)
+        self.log = Log(1 if restarting else self.ticks, size)
         self.goals = Goals(scenarios, timed=not restarting)
         self.outcome = Outcome(self.plant, self.hierarchy, self.estimator, self.period)
         self._sensed = False  # whether the coming tick is sensed

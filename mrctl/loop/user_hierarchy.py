@@ -46,10 +46,10 @@ def command_all(seen: Rows, reference: Rows, robot: Rows, period: float, control
 
 
 @kernel
-def watch_all(seen: Rows, model: Rows, robot: Rows, period: float, control: Rows) -> None:
+def watch_all(model: Rows, robot: Rows, period: float, control: Rows) -> None:
     """Calls `watch` for all robots."""
     for i in range(len(control)):
-        watch(seen[i], model[0], robot[0], period, control[i])
+        watch(model[0], robot[0], period, control[i])
 
 
 @kernel
@@ -132,7 +132,7 @@ class UserHierarchy(Hierarchy):
             self._feed_back(feedback, seen["twist"])
         state["feedforward"] = self.feedforward(self.command, self.derivative)
         self._read_weight_norm()
-        watch_all(seen, self.model.rows, *constants, state)
+        watch_all(self.model.rows, *constants, state)
         if stage := self.stages.get("steering"):
             self._steer(stage)
         else:

@@ -18,7 +18,7 @@ from mrctl.control.guard import GUARD_ACTIONS, REASONS, Guard, fresh, guard
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.nominal import NOMINAL
 from mrctl.control.oscillation import DRIFT_FILTER, NOISE_FILTER
-from mrctl.control.pid import Pid
+from mrctl.control.pid import PID, Pid
 from mrctl.control.rejection import LinearLoop
 from mrctl.control.rls import RecursiveLeastSquares, Rls
 from mrctl.theory.linear import common, yaw
@@ -36,17 +36,18 @@ class Bench:
         robot = np.zeros(1, NOMINAL)
         robot["supply"], robot["max_twist"], robot["rigid"] = SUPPLY, (1.5, ROTATION), rigid
         self.g = fresh([Guard(**settings)], robot, np.array([gains]))[0]
-        self.rigid, self.integral, self.feedback = rigid, np.zeros(2), np.zeros(2)
+        self.rigid, self.pid, self.feedback = rigid, np.zeros(1, PID)[0], np.zeros(2)
+        self.integral = self.pid["integral"]
         self.ticks = 0
 
     def tick(self, feedforward=(0, 0), nominal=(0, 0), feedback=(0, 0), error=0.0, slower=(0, 0), sent=None):
         self.feedback[:] = feedback
         nominal = np.array(nominal, float)
         voltage = nominal if sent is None else np.array(sent, float)
+        self.pid["error"] = slower
         guard(
-            self.g, np.array(feedforward, float), nominal, np.resize([*np.atleast_1d(error), 0.0, 0.0], 3),
-            np.array([0.5, 0.0]), np.array([0.5, 0.0]) - slower, voltage, PERIOD, self.rigid, self.integral,
-            self.feedback,
+            self.g, np.array(feedforward, float), nominal, np.resize([*np.atleast_1d(error), 0.0, 0.0], 3), voltage,
+            PERIOD, self.rigid, self.pid, self.feedback,
         )  # fmt: skip
         self.ticks += 1
         return GUARD_ACTIONS[int(self.g["action"])]
