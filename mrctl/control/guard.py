@@ -1,17 +1,20 @@
 """A watchdog on a learning feedforward: it replaces the learner by the nominal model, and lets it try again.
 
 This is the simplex architecture (Seto, Krogh, Sha and Chutinan 1998): a controller that may be wrong has full authority
-as long as the state is one from which a trusted one, here PID and nominal model, recovers. Let d be the deviation of a
-channel, d = authority · (learner − model), e the error of its velocity, ρ the posture error, and ρ_min the least ρ so
-far. The region of recovery is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if the peak of its |d|,
-which decays with a time constant of 1 s, exceeds D or, for a posture error, D_ρ, and for an oscillation if it exceeds a
-quarter of D. What learning has taken from the PID's integral counts like a d; its sum decays with the same time
-constant.
+as long as a trusted one, here PID and nominal model, can recover from the present state.
+
+**Symbols.** In each channel d = authority · (learner − model) is the deviation, and e the error of the velocity. The
+posture error is ρ, and ρ_min the least ρ so far. The region of recovery is |e| ≤ ē and ρ ≤ ρ̄ = 0.15 m. The largest
+deviations that cannot take e or ρ out of it are
 
     D = ē/‖G_e‖₁,    D_ρ = min(D, ρ̄/(√2 ‖G_ρ‖₁))
 
 ‖G‖₁ are the peak-to-peak gains of the designed loops from a voltage (`rejection`); √2, as ρ² is the sum of the squares
 of what the two channels contribute. With the PIDs of the tiers D_ρ = D.
+
+**Blame.** The guard keeps the peak of |d|, which decays with a time constant of 1 s. The learner is to blame for an
+error e if this peak exceeds D, for an error ρ if it exceeds D_ρ, and for an oscillation if it exceeds D/4. The voltage
+that learning has taken from the PID's integral counts like a d; the sum of it decays with the same time constant.
 
 | cause of a fallback   | condition                                                                         |
 | --------------------- | --------------------------------------------------------------------------------- |
@@ -19,32 +22,33 @@ of what the two channels contribute. With the PIDs of the tiers D_ρ = D.
 | sustained oscillation | 16 half-waves of the PID's output in a row beyond D/4 while it is to blame        |
 | not finite            | NaN or ∞ from the learner                                                         |
 
-After a hold of 1 s the learner, reset to its initial weights, resumes, and its authority grows from 0 again in 5 s.
-Each further time the hold is three times as long. After an oscillation, and from the second time on, the feedback that
-teaches is a third of the one before (`mrac` is not taught by it), and the authority grows three times as slowly.
+**Return.** After a hold of 1 s the learner resumes with its initial weights, and its authority grows from 0 to 1 in
+5 s. Each further hold is three times as long as the one before. After an oscillation, and after each fallback from the
+second on, the feedback that teaches is divided by three (`mrac` is not taught by it), and the authority grows three
+times as slowly.
 
 **What it guarantees.**
 
-1. |d| ≤ D_ρ all along: no d, however it oscillates or grows, takes ρ, or e for the same command, out of the region. The
+1. While |d| ≤ D_ρ, d cannot take ρ out of the region, however it oscillates or grows, nor e for the same command. The
    guard leaves such a learner alone, unless the loop oscillates. With |d| ≤ D this holds for e. The motion controller
-   answers d too, which moves the command: against that, e is at most 1.3 ē for the default robot.
+   answers d too, and so changes the command: with that, e is at most 1.3 ē for the default robot.
 2. An error that leaves the region while the learner is to blame ends it in the same tick. Until then the errors are
    inside. A learner that has come back within the bounds is no longer to blame once the peak of its |d| has decayed,
    but an error that it has caused may still grow. In the worst case found (by linear programming, for the default
    robot and the same command) e reaches 1.10 ē with the PID of `lab`, 1.13 ē with that of `field`, and with the slow
    one of the paper 1.7 ē, and ρ 0.22 m.
-3. After a fallback PID and model act alone. The PID's integral starts within D of the model, and the rest of the step
-   in voltage, which fades, is within D too. From any such state the position error stays below a bound that both loops
-   give: 0.23 to 0.27 m for the default robot (`recovery` in `tests/system/test_adversaries.py`, which counts the rest
-   of the step as a part of the integral).
+3. After a fallback PID and model act alone. The integral of the PID and the feedforward together start within D of the
+   model, and the rest of the step in voltage, which fades, is within D too. From any such state the position error
+   stays below a bound that both loops give: 0.23 to 0.27 m for the default robot (`recovery` in
+   `tests/system/test_adversaries.py`, which counts the rest of the step as a part of the integral).
 
-The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
+The bounds are those of the linear loops that the PID was designed for. The limits of voltage and acceleration, and what
 happens within the loop's delay, add to them: under `rigid` steering with the PID of the paper ρ reached 0.22 m with |d|
 within D. `tests/system/test_adversaries.py` drives against the worst learners.
 
-The oscillation is no part of the guarantee. A loop with more delay than it was designed for may oscillate within the
-region, and tracks better without the learner. `delay` answers faster and smaller oscillations than the guard does, with
-slower controllers and a third of the feedback that teaches.
+The answer to oscillations is no part of the guarantee. A loop with more delay than it was designed for may oscillate
+within the region, and tracks better without the learner. `delay` answers faster and smaller oscillations than the guard
+does, with slower controllers and a third of the feedback that teaches.
 """
 
 from __future__ import annotations
