@@ -128,11 +128,11 @@ def hand_over(s: Row) -> None:
 
 
 @kernel
-def update(moves: bool, seen: Rows, reference: Rows, period: float, place: int) -> tuple[bool, bool]:
+def update(motion_due: bool, seen: Rows, reference: Rows, period: float, place: int) -> tuple[bool, bool]:
     """One control tick of all robots, with the learner `respond` and `learn_one`.
 
     Args:
-        moves: Whether the motion controller acts in this tick.
+        motion_due: Whether the motion controller acts in this tick.
         seen: Record of `SEEN` of each robot.
         reference: Record of `REFERENCE` of each robot.
         period: Control period in s.
@@ -147,7 +147,7 @@ def update(moves: bool, seen: Rows, reference: Rows, period: float, place: int) 
     finite, asks = True, False
     for i in range(len(control)):
         s, measured, wanted = control[i], seen[i], reference[i]
-        if moves:
+        if motion_due:
             request_motion(measured, wanted, s)
         command_motion(wanted, robot[0], period, s)
         command, derivative = s.limiter.command, s.limiter.derivative
@@ -192,6 +192,11 @@ class Settings:
     delay: float
     learned: Any
     design: MotionDesign = field(init=False)
+
+    @property
+    def motion(self) -> MotionDesign:
+        """The motion controller: its design, in which gains that are set replace the designed ones."""
+        return self.design._replace(kanayama=self.kanayama.completed(self.design.kanayama))
 
 
 class Hierarchy:
@@ -266,7 +271,7 @@ class Hierarchy:
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
         for row in range(size):
-            self._watch(row)
+            self._set_watch(row)
             self._design_pid(row)
             self._design_motion(row)
         rejected = np.array([self._rejection(row) for row in range(size)])
@@ -288,23 +293,23 @@ class Hierarchy:
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are those of its last design."""
         self.settings[row].kanayama = gains
-        self._complete(row)
+        self._set_motion(row)
         self._tolerate(row)
 
-    def _complete(self, row: int) -> None:
-        """Completes the gains of the motion controller of one robot with those of its design."""
-        own = self.settings[row]
-        chosen = own.kanayama.completed(own.design.kanayama)
-        self.state["kanayama"][row] = chosen.k_x, chosen.k_y, chosen.k_theta
+    def _set_motion(self, row: int) -> None:
+        """Writes the gains and the prefilter of one robot into its record."""
+        gains, prefilter, _ = self.settings[row].motion
+        self.state["kanayama"][row] = gains.k_x, gains.k_y, gains.k_theta
+        self.state["limiter"]["time_constant"][row] = prefilter
 
     def set_pid(self, row: int, design: Pid) -> None:
         """Changes the PID of one robot; what an oscillation has shown of its loop stays, unless it is not watched."""
         self.settings[row].pid = design
-        self._watch(row)
+        self._set_watch(row)
         self._design_pid(row)
         self._tolerate(row)
 
-    def _watch(self, row: int) -> None:
+    def _set_watch(self, row: int) -> None:
         """Decides whether the loop of one robot is watched for oscillations; only that of the built-in PID can be."""
         design, watch = self.settings[row].pid, self.state["delay"]
         watched = design.retune and design.time_constant is None and "feedback" not in self.stages
@@ -355,8 +360,7 @@ class Hierarchy:
         pid, delay = self.lengthened(row, own.pid, ahead=1)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
         own.design = motion(self.robot, self.rigid, gains, delay, self.period, own.prefilter)
-        self.state["limiter"]["time_constant"][row] = own.design.prefilter
-        self._complete(row)
+        self._set_motion(row)
 
     def _tolerate(self, row: int) -> None:
         """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
@@ -366,13 +370,10 @@ class Hierarchy:
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
         """Returns the peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
-        k, own = self.state["kanayama"][row], self.settings[row]
+        own = self.settings[row]
         pid, delay = self.lengthened(row, own.pid)
-        kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
-        prefilter = float(self.state["limiter"]["time_constant"][row])
-        around = MotionDesign(kanayama, prefilter, own.design.lag)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
-        return rejection(self.robot, self.rigid, gains, around, delay, self.period)
+        return rejection(self.robot, self.rigid, gains, own.motion, delay, self.period)
 
     def set_reference(self, row: int, reference: Reference) -> None:
         """Does nothing: the built-in law reads the reference in each tick. `UserHierarchy` tells the user's stage."""
@@ -413,7 +414,7 @@ class Hierarchy:
         return self.period * self._every
 
     @property
-    def moves(self) -> bool:
+    def motion_due(self) -> bool:
         """Whether the motion controller acts in the coming tick."""
         return (self.tick - self.started) % self._every == 0
 
@@ -448,7 +449,7 @@ class Hierarchy:
         Returns:
             `output`, `(B, 4)`.
         """
-        finite, asks = self._update(self.moves, seen, reference, self.period, self._held.place)
+        finite, asks = self._update(self.motion_due, seen, reference, self.period, self._held.place)
         if asks:
             self.answer()
         self.faults = {} if finite else self.non_finite()  # the voltage limit would turn NaN into the full voltage

@@ -122,9 +122,9 @@ class UserHierarchy(Hierarchy):
                 stage.ask("follow", row, plan)
             self._new = {}
             self._show(stage, seen["estimate"])
-            if self.moves:
+            if self.motion_due:
                 self._wanted = self._request(stage, seen, reference)
-        elif self.moves:
+        elif self.motion_due:
             request_all(seen, reference, state)
         command_all(seen, reference if self._wanted is None else self._wanted, *constants, state)
         feedback = self.stages.get("feedback")
@@ -164,9 +164,8 @@ class UserHierarchy(Hierarchy):
 
     def _tune_motion(self, row: int) -> None:
         """Tells the user's motion controller, if it asks for that, the gains of one robot."""
-        own = self.settings[row]
         if (stage := self.stages.get("motion")) and stage.has("tune"):
-            stage.ask("tune", row, own.kanayama.completed(own.design.kanayama))
+            stage.ask("tune", row, self.settings[row].motion.kanayama)
 
     def set_reference(self, row: int, reference: Reference) -> None:
         """Tells the user's motion controller, if it asks for that, that one robot has another reference."""
