@@ -8,6 +8,7 @@ held for one control period, so an integral over time is a sum times that period
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -166,9 +167,34 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     narrow = runs[[name for name in ("x", "failed", "failure_time") if name in runs]]
     divisions = [laps_of(narrow.isel(run=row)) for row in range(size)]
     counts = [len(laps.edges) - 1 for laps in divisions]
+    values = _values(runs, divisions, period)
+    variables: dict[str, tuple] = {
+        name: (("run", "lap"), values[name], {"units": unit, "long_name": text})
+        for name, (unit, text) in METRICS.items()
+    }
+    variables["laps"] = ("run", counts, {"units": "1", "long_name": "whole laps"})
+    variables["failed"] = ("run", [laps.failed is not None for laps in divisions])
+    nan = np.full(size, np.nan)
+    variables["failure_time"] = ("run", runs["failure_time"].values if "failure_time" in runs else nan, {"units": "s"})
+    coords = {name: ("run", runs[name].values) for name in ("run", *PER_RUN) if name in runs.coords}
+    return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
+
+
+def _values(runs: xr.Dataset, divisions: Sequence[Laps], period: float) -> dict[str, Array]:
+    """Computes the metrics of every lap of every run, those of runs with the same laps together.
+
+    Args:
+        runs: Signals (run, time).
+        divisions: The laps of each run.
+        period: Seconds between the samples.
+
+    Returns:
+        The metrics of `METRICS` by name, `(runs, laps)`; NaN beyond the laps of a run, and from a failure on.
+    """
     scaled = {"half_track", "feature_scale"} <= set(runs.variables)
     data = {name: runs[name].transpose("run", "time").values.astype(float) for name in SAMPLED}
-    values = {name: np.full((size, max(counts, default=0)), np.nan) for name in METRICS}
+    most = max((len(laps.edges) - 1 for laps in divisions), default=0)
+    values = {name: np.full((len(divisions), most), np.nan) for name in METRICS}
     begins = not runs["time"].values[:1].any()
     groups: dict[tuple[int, ...], list[int]] = {}
     for row, laps in enumerate(divisions):
@@ -191,16 +217,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         if laps.failed is not None:
             for value in values.values():
                 value[row, laps.failed :] = np.nan
-    variables: dict[str, tuple] = {
-        name: (("run", "lap"), values[name], {"units": unit, "long_name": text})
-        for name, (unit, text) in METRICS.items()
-    }
-    variables["laps"] = ("run", counts, {"units": "1", "long_name": "whole laps"})
-    variables["failed"] = ("run", [laps.failed is not None for laps in divisions])
-    nan = np.full(size, np.nan)
-    variables["failure_time"] = ("run", runs["failure_time"].values if "failure_time" in runs else nan, {"units": "s"})
-    coords = {name: ("run", runs[name].values) for name in ("run", *PER_RUN) if name in runs.coords}
-    return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
+    return values
 
 
 def lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) -> dict[str, Array]:
