@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from mrctl.kernel import Array, Row, Rows
+from mrctl.physics.obstacles import quaternion
 from mrctl.viewer.looks import Colour
 from mrctl.viewer.shapes import Mesh, add_mesh, ball, bar
 
@@ -75,8 +76,7 @@ class Target:
         if not self._root.visible:
             return
         self._root.position = now["x_ref"], now["y_ref"], ground + self._height
-        half = np.arctan2(y, x) / 2
-        self._root.wxyz = np.cos(half), 0.0, 0.0, np.sin(half)
+        self._root.wxyz = quaternion(np.arctan2(y, x))
         length = float(np.hypot(x, y))
         self._ball.position = length, 0.0, 0.0
         self._line.scale = max(length, 1e-6), 1.0, 1.0

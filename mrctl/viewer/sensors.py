@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from mrctl.kernel import Array, Row, Rows
+from mrctl.physics.obstacles import quaternion
 from mrctl.theory.kinematics import UP
 from mrctl.viewer.looks import Colour
 from mrctl.viewer.shapes import add_mesh, disc, ribbons
@@ -94,16 +95,15 @@ class Marks:
         self._root.visible = bool(len(log) and np.isfinite(log["x_measured"][-1]))
         if not self._root.visible:
             return
-        last, turn = log[-1], log["theta_measured"][-1] / 2
+        last = log[-1]
         middle = here + self._level * UP
         estimate = middle + [*magnified * error(last), 0]  # the robot may be drawn a moment after the sample
-        self._estimate.position, self._estimate.wxyz = estimate + NEXT_MARK * UP, (np.cos(turn), 0.0, 0.0, np.sin(turn))
+        self._estimate.position, self._estimate.wxyz = estimate + NEXT_MARK * UP, quaternion(last["theta_measured"])
         self._truth.position = middle + 3 * NEXT_MARK * UP
         self._ellipse.visible = bool(last["variance_x"] > 0)
         if self._ellipse.visible:
             (a, b), angle = ellipse(last)
-            self._ellipse.position = estimate
-            self._ellipse.wxyz = np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)
+            self._ellipse.position, self._ellipse.wxyz = estimate, quaternion(angle)
             self._area.scale = self._rim.scale = (magnified * a, magnified * b, 1.0)
         arrived = np.flatnonzero(np.isfinite(log["fix_x"]))
         age = (len(log) - 1 - arrived) * period
