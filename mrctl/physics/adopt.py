@@ -501,11 +501,12 @@ class _Adoption:
         if not 0 < limit < np.pi / 2:
             raise InputError(f"steering: {_listed(self.steered)} needs a range below 90° on either side of straight on")
         anchors = [self._rotation() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]
+        unit = 180 / np.pi if self.spec.compiler.degree else 1.0  # in which the file gives the range of its own joint
         if len(anchors) == 2:
-            limit = self._add_linkage(spec, anchors, limit, kv)
+            limit, unit = self._add_linkage(spec, anchors, limit, kv), 1.0
         joint = spec.joint("steering")
         joint.limited = 1
-        joint.range = np.array([-limit, limit]) * (180 / np.pi if self._in_degrees(len(anchors)) else 1.0)
+        joint.range = np.array([-limit, limit]) * unit
         servo = spec.add_actuator(name="steering", target="steering", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_pid(kp=kp, kv=kv)
         if self.model.actuator_forcelimited[servos].all():
@@ -544,10 +545,6 @@ class _Adoption:
             linkage.solref[:] = 0.01, 1.0
             spec.joint(f"steering_{name}").limited = 0  # the rack has the stops
         return limit
-
-    def _in_degrees(self, steered: int) -> bool:
-        """Tells whether the joint `steering` comes from the file and the file gives angles in degrees."""
-        return steered == 1 and bool(self.spec.compiler.degree)
 
     def _turns_steering(self, actuator: int) -> bool:
         """Tells whether an actuator moves a steered joint."""
