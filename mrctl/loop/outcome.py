@@ -169,10 +169,8 @@ class Outcome:
         around = [s.obstacles for s in scenarios]
         if not around[0].shapes:
             return {}
-        footprint, made = (
-            hull.footprint(self._plant.models[0]),
-            {own: Surroundings(own) for own in dict.fromkeys(around)},
-        )
+        footprint = hull.footprint(self._plant.models[0])
+        made = {own: Surroundings(own) for own in dict.fromkeys(around)}
         poses = np.stack([ticks[name].T for name in ("x", "y", "theta")], -1)
         times = self._period * np.arange(len(ticks), dtype=float)
         found = np.stack([clearances(footprint, poses[row], times, made[own]) for row, own in enumerate(around)])
