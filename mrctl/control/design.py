@@ -68,6 +68,7 @@ def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
     return found[:1] if rigid or channel == 0 else found
 
 
+@lru_cache(maxsize=256)
 def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: float = 0.01) -> tuple[Gains, Gains]:
     """Designs the PI gains of both channels, in V/(m/s) and V/m and in V/(rad/s) and V/rad, or 1 and 1/s if rigid.
 
@@ -80,11 +81,6 @@ def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: fl
         lag: Time constant in s with which the measured twist follows the true one.
         period: Control period in s.
     """
-    return _design(robot, rigid, delay, lag, period)
-
-
-@lru_cache(maxsize=256)
-def _design(robot: Robot, rigid: bool, delay: float, lag: float, period: float) -> tuple[Gains, Gains]:
     electric = robot.inductance / robot.resistance  # s, time constant of the armature, which counts as a lag
     common = fastest_pi(plants(robot, rigid, 0), period, delay, lag + electric)
     second = fastest_pi(plants(robot, rigid, 1), period, delay, lag if rigid else lag + electric)
@@ -151,6 +147,7 @@ class MotionDesign(NamedTuple):
     lag: tuple[float, float]
 
 
+@lru_cache(maxsize=256)
 def motion(
     robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float = 0.0, period: float = 0.01,
     prefilter: float | None = None,
@@ -194,13 +191,6 @@ def motion(
         period: Control period in s.
         prefilter: Time constant of the prefilter in s, if it is given; it is at least the control period.
     """
-    return _motion(robot, rigid, gains, delay, period, prefilter)
-
-
-@lru_cache(maxsize=256)
-def _motion(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float, period: float, given: float | None
-) -> MotionDesign:
     _, free = max(points(robot.model_copy(update={"fork_inertia": 0.0}), False, 1), key=lambda point: point[0])
     v_lag = 1 / (linear.common(robot).gain * gains[0].k_i)
     omega_lag = linear.TYRE_LAG + delay if rigid else 1 / (free.gain * gains[1].k_i)
@@ -210,24 +200,24 @@ def _motion(
     turned = robot.max_rotation_acceleration / robot.max_speed**2
     reached = (robot.max_acceleration / CORRECTED_ERROR) ** (1 / 2), (turned / CORRECTED_ERROR) ** (1 / 3)
     shares = np.linspace(0, 1, 21)
-    prefilter = max(period, v_lag / 2, omega_lag / 2) if given is None else max(period, given)
-    best, chosen = 0.0, (0.0, 0.0, prefilter)
+    tried = max(period, v_lag / 2, omega_lag / 2) if prefilter is None else max(period, prefilter)
+    best, chosen = 0.0, (0.0, 0.0, tried)
     while True:
-        damped = 1 / (4 * DAMPING**2 * (v_lag + prefilter)), kappa / ((omega_lag + prefilter) * robot.max_speed)
+        damped = 1 / (4 * DAMPING**2 * (v_lag + tried)), kappa / ((omega_lag + tried) * robot.max_speed)
         k_x = min(damped[0], reached[0], PUBLISHED_K_X)
         lateral = min(damped[1], reached[1], PUBLISHED_K_THETA / 2)
         if k_x * lateral <= best:  # by the first three bounds no slower prefilter is better
             break
-        tried = np.array([shares * k_x, (shares * lateral) ** 2, 2 * shares * lateral])
-        peaks = sensitivity(robot, rigid, gains, tried, prefilter, delay, period)
+        kanayama = np.array([shares * k_x, (shares * lateral) ** 2, 2 * shares * lateral])
+        peaks = sensitivity(robot, rigid, gains, kanayama, tried, delay, period)
         k_x, lateral = k_x * _kept(shares, peaks[0]), lateral * _kept(shares, peaks[1])
         if k_x * lateral > best:
-            best, chosen = k_x * lateral, (k_x, lateral, prefilter)
-        if given is not None:
+            best, chosen = k_x * lateral, (k_x, lateral, tried)
+        if prefilter is not None:
             break
-        prefilter *= 1.1
-    k_x, lateral, prefilter = chosen
-    return MotionDesign(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
+        tried *= 1.1
+    k_x, lateral, found = chosen
+    return MotionDesign(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), found, (v_lag, omega_lag))
 
 
 def _kept(shares: Array, peaks: Array) -> float:

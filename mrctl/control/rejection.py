@@ -43,6 +43,7 @@ class Peaks(NamedTuple):
     posture: float
 
 
+@lru_cache(maxsize=1024)
 def rejection(
     robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: MotionDesign, delay: float, period: float
 ) -> tuple[Peaks, Peaks]:
@@ -58,13 +59,6 @@ def rejection(
         delay: Delay from measurement to voltage in s.
         period: Control period in s.
     """
-    return _rejection(robot, rigid, gains, motion, delay, period)
-
-
-@lru_cache(maxsize=1024)
-def _rejection(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: MotionDesign, delay: float, period: float
-) -> tuple[Peaks, Peaks]:
     found = []
     alone = motion._replace(kanayama=Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0))
     for channel in range(2):
