@@ -27,6 +27,7 @@ from mrctl.physics.mjcf import clone
 from mrctl.physics.perturb import perturb
 from mrctl.physics.readout import READING, addresses, inputs, read_all
 from mrctl.physics.stand import stand
+from mrctl.physics.units import loss_torque
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import Robot
 
@@ -208,7 +209,7 @@ def settling_time(robot: Robot) -> float:
 
 def loss_voltage(robot: Robot) -> float:
     """Returns the voltage in V that overcomes all Coulomb losses while the robot drives straight on."""
-    return (robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2) / robot.motor_gain
+    return loss_torque(robot) / robot.motor_gain
 
 
 def holding_force(robot: Robot) -> float:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from tqdm import trange
 
-from mrctl.checks.open_loop import on_skid
+from mrctl.checks.open_loop import loss_voltage, on_skid
 from mrctl.experiments.tables import json_text, machine, markdown
 from mrctl.kernel import Array
 from mrctl.physics import mjcf
@@ -231,8 +231,7 @@ def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
         answer = spectrum * gain / (1 + 1j * omega * tau)
         peaks = [np.abs(np.fft.irfft(part, samples)).max() for part in (answer, 1j * omega * answer)]
         found[:, k] = np.fft.irfft(spectrum, samples) * min(reach / peaks[0], acceleration / 1.5 / peaks[1])
-    loss = (robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2) / robot.motor_gain
-    return found + [speed / robot.velocity_gain + loss, 0.0]
+    return found + [speed / robot.velocity_gain + loss_voltage(robot), 0.0]
 
 
 def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Generator, turns: bool) -> list[Drive]:

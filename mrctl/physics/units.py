@@ -62,13 +62,17 @@ class Mistake(NamedTuple):
 
 def reach(robot: Robot) -> Array:
     """Returns the largest V, θ̇, V̇ and θ̈ that the motors reach by equation (3), `(4,)`, in SI units."""
-    loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
     per_volt = robot.drive_gain * robot.motor_gain  # torque per commanded volt, N·m/V
-    stall = per_volt * robot.supply - loss
+    stall = per_volt * robot.supply - loss_torque(robot)
     speed = robot.velocity_gain * stall / per_volt
     force = 2 * stall / robot.wheel_radius
     turning = force * robot.half_track / robot.effective_inertia
     return np.array([speed, speed / robot.half_track, force / robot.effective_mass, turning])
+
+
+def loss_torque(robot: Robot) -> float:
+    """Returns the torque in N·m that all Coulomb losses take at each driven wheel on a straight line."""
+    return robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
 
 
 def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
@@ -119,7 +123,6 @@ def bounds(robot: Robot) -> list[Bound]:
     """Lists quantities and their bounds, which are chosen: 5000 kg/m³, motors of 10⁶ rpm, tyres with μ = 3."""
     size = robot.size
     stall = robot.motor_gain * robot.supply
-    loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
     found = [
         Bound("mass over the cube of the size", robot.mass / size**3, 0.5, 5000, "kg/m³"),
         Bound("size, of wheelbase and track", size, 0.01, 15, "m"),
@@ -128,7 +131,7 @@ def bounds(robot: Robot) -> list[Bound]:
         Bound("rolling resistance over the load", robot.rolling_coefficient, 0, 0.5, ""),
         Bound("no-load speed of the motors", robot.supply / robot.torque_constant * RPM_PER_RAD_S, 10, 1e6, "rpm"),
         Bound("stall current of the motors", robot.supply / robot.resistance, 0.01, 5000, "A"),
-        Bound("losses over the stall torque", loss / stall, 0, 0.9, ""),
+        Bound("losses over the stall torque", loss_torque(robot) / stall, 0, 0.9, ""),
     ]
     if found[-1].margin > 0:
         shares = [getattr(robot, name) for name in LIMITS] / reach(robot)
