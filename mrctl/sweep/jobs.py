@@ -331,19 +331,24 @@ def _compute(
             # A stage that raises ends its whole batch; computed alone, a run does not depend on the others.
             queue.extend((own, {run: scenario}) for run, scenario in batch.items())
             continue
-        laps = metrics.per_lap(result)
-        texts = {name: result[name].values for name in ("failure", *FAULTS)}
-        samples_kept = -(-result["samples"].values // sweep.stride)  # if the run lasts
-        table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, samples=samples_kept, **texts)
-        if sweep.record == "laps":
-            for name in metrics.METRICS:
-                table[f"{name}_per_lap"] = [v[:n] for v, n in zip(laps[name].values, laps["laps"].values, strict=True)]
-        for run, found in zip(batch, table.to_dict("records"), strict=True):
-            rows[run] = _row(sweep, run, **{str(name): value for name, value in found.items()})
+        rows |= _measured(sweep, batch, result)
         if signals is not None:
             kept = np.stack([result[name].values[:, :: sweep.stride] for name in SIGNALS], axis=-1)
             signals[[run - runs[0] for run in batch], : kept.shape[1]] = kept
     return [rows[run] for run in runs], signals
+
+
+def _measured(sweep: Sweep, runs: Iterable[int], result: xr.Dataset) -> dict[int, dict[str, Any]]:
+    """Returns the rows of runs of a sweep that were driven, by run, with the metrics of their result."""
+    laps = metrics.per_lap(result)
+    texts = {name: result[name].values for name in ("failure", *FAULTS)}
+    samples = -(-result["samples"].values // sweep.stride)  # that are kept if the run lasts
+    table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, samples=samples, **texts)
+    if sweep.record == "laps":
+        for name in metrics.METRICS:
+            table[f"{name}_per_lap"] = [v[:n] for v, n in zip(laps[name].values, laps["laps"].values, strict=True)]
+    found = zip(runs, table.to_dict("records"), strict=True)
+    return {run: _row(sweep, run, **{str(name): value for name, value in row.items()}) for run, row in found}
 
 
 def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str, Any]:

@@ -200,9 +200,9 @@ class Sweep(Record):
 
     def base_of(self, run: int) -> Scenario:
         """Returns the base with what the axis of controllers sets in one run, which need not be valid itself."""
-        return (
-            self.base.replace(**self._chosen[self.values(run)[CONTROLLER_FIELD]].fields) if self._chosen else self.base
-        )
+        if not self._chosen:
+            return self.base
+        return self.base.replace(**self._chosen[self.values(run)[CONTROLLER_FIELD]].fields)
 
     @property
     def drivers(self) -> dict[str | None, list[int]]:
