@@ -3,8 +3,8 @@
 Some places inside each obstacle are looked at. It is gone when beams have passed through 90 % of them, through each in
 at least five scans. One scan proves little, because the pose from which it seems to be taken is estimated. An obstacle
 is back when points of a scan lie on it again. What is gone is gone as a whole: a wall with a new door stays. A point
-that may be of two obstacles counts for the nearer one. From far away a thing may therefore be taken for gone where the
-error of the estimate moves its points to a wall behind it, until a scan from nearby shows it.
+that may be of two obstacles shows neither. From far away a thing may therefore be taken for gone where the error of the
+estimate moves its points to a wall behind it, until a scan from nearby shows it.
 """
 
 from __future__ import annotations
@@ -101,23 +101,23 @@ class Chart:
     def _shown(self, shape: int, points: Array, margin: Array) -> bool:
         """Tells whether points of a scan, `(k, 2)`, lie on an obstacle, or within margins in m, `(k,)`, of it.
 
-        A point that lies nearer to another obstacle belongs to that one.
+        Points within the margin of another obstacle on the map do not count: where two walls meet, a scan shows points
+        of both, also if one of them is gone.
         """
         middle, radius = self._middles[shape], self._radii[shape]
         near = np.hypot(*(points - middle).T) < radius + margin
         if np.sum(near) < MIN_POINTS:
             return False
         points, margin = points[near], margin[near]
-        away = self._distances(shape, points)
-        points, away = points[away < margin], away[away < margin]
-        others = np.hypot(*(self._middles - middle).T) < radius + self._radii + MAX_FAR_OFFSET
+        on = self._distances(shape, points) < margin
+        others = ~self._gone & (np.hypot(*(self._middles - middle).T) < radius + self._radii + MAX_FAR_OFFSET)
         others[shape] = False
         for other in np.flatnonzero(others).tolist():
+            points, margin = points[on], margin[on]
             if len(points) < MIN_POINTS:
                 return False
-            own = away <= self._distances(other, points)
-            points, away = points[own], away[own]
-        return len(points) >= MIN_POINTS
+            on = self._distances(other, points) >= margin
+        return int(on.sum()) >= MIN_POINTS
 
 
 @kernel
