@@ -29,6 +29,7 @@ WRITTEN_BY = "# written by mrctl "  # how a TOML file begins that `to_toml` made
 BOUNDS = "greater_than", "greater_than_equal", "less_than", "less_than_equal"  # errors of pydantic
 _BASE = "(?:kg|rad|Hz|[msNVAΩH])²?"
 UNIT = re.compile(rf" in ({_BASE}(?:[·/]{_BASE})*)(?=[.,;]| (?!per |√))")  # in the docstring of a field
+POSE = re.compile("[Pp]ose.*: x and y in m, (?:θ|and its rotation) in rad")  # the docstring of a field that is a pose
 FIELD_GONE = "this field of an earlier version is gone"
 
 
@@ -275,7 +276,10 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
         record: The record that is refused, among whose fields is the one for which a misspelt one may stand.
     """
     first, *rest = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-    field = ".".join(str(part) for part in first["loc"])
+    *parents, last = first["loc"] or [""]
+    if last in (0, 1, 2) and POSE.match(_description(record, parents)):
+        last = "xyθ"[last]
+    field = ".".join(map(str, [*parents, last]))
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         *parents, name = first["loc"]
@@ -309,10 +313,18 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
 
 def _unit(record: type[Record] | None, path: Sequence[int | str]) -> str:
     """Returns the unit that a field's docstring gives, with a space before it; "" where it gives none."""
-    *parents, name = path
-    fields = [one.model_fields[str(name)] for one in _records_at(record, parents) if str(name) in one.model_fields]
-    found = UNIT.search(fields[0].description or "") if fields else None
+    about = _description(record, path)
+    if not about and POSE.match(_description(record, path[:-1])):
+        return " rad" if path[-1] == 2 else " m"
+    found = UNIT.search(about)
     return f" {found[1]}" if found else ""
+
+
+def _description(record: type[Record] | None, path: Sequence[int | str]) -> str:
+    """Returns the docstring of the field at a path within a record; "" where that is none."""
+    *parents, name = path or [""]
+    fields = [one.model_fields[str(name)] for one in _records_at(record, parents) if str(name) in one.model_fields]
+    return (fields[0].description or "") if fields else ""
 
 
 def is_whole(count: float) -> bool:

@@ -157,7 +157,7 @@ class Scenario(Record):
     initial_pose: tuple[float, float, float] | None = None
     """Pose at the start: x and y in m, θ in rad; by default that of the reference."""
     goal: tuple[float, float, float] | None = None
-    """Pose at which the run ends, x and y in m, θ in rad; by default only the laps end it. The run fails
+    """Pose at which the run ends: x and y in m, θ in rad; by default only the laps end it. The run fails
     as `stuck` if the robot moves less than 5 cm in 5 s."""
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of a random offset from the initial pose: x and y in m, θ in rad."""

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import math
 import pydoc
 import tomllib
 from pathlib import Path
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mrctl
+from mrctl.navigation.generators import Task
 from mrctl.record import InputError, Record
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.perturbation import Perturbation
@@ -235,6 +237,16 @@ def test_unit_of_a_bound(fields, end):
     with pytest.raises(InputError) as error:
         Scenario.from_dict(fields)
     assert str(error.value).endswith(end)
+
+
+def test_part_of_a_pose():
+    """A bad part of a pose has its name and unit, as 90° for a heading must be seen to be in rad."""
+    with pytest.raises(InputError, match=r"^goal\.θ: Input should be a finite number"):
+        Scenario(goal=(1.0, 0.0, math.inf))
+    with pytest.raises(InputError, match=r"^start\.θ: Input should be less than or equal to 7 rad$"):
+        Task.from_dict({"obstacles": {}, "start": (0, 0, 90), "goal": (1, 0, 0)})
+    with pytest.raises(InputError, match=r"^reference\.waypoints\.points\.1\.1: "):  # which is no pose
+        Scenario.from_dict({"reference": {"kind": "waypoints", "points": [(0, 0), (1, "y"), (2, 2)]}})
 
 
 def test_paths():

@@ -91,7 +91,7 @@ def test_unknown(source):
         ("laps", {"laps": 0}),
         ("seed", {"seed": -1}),
         ("initial_spread.2", {"initial_spread": [0, 0, 9]}),
-        ("initial_pose.0", {"initial_pose": [float("nan"), 0, 0]}),
+        ("initial_pose.x", {"initial_pose": [float("nan"), 0, 0]}),
         ("events.0: changes nothing", {"events": [{"time": 1, "push_duration": 5}]}),
         ("perturbation.supply_factor", {"perturbation": {"supply_factor": 1e-3}}),
         ("mrac.noise", {"mrac": {"noise": 1e-200}}),
