@@ -26,8 +26,8 @@ def read_sdf(path: str | Path) -> Obstacles:
         path: The `.world` or `.sdf` file.
 
     Raises:
-        InputError: The file is no SDF world, a pose is relative to a frame that it names, or one of the shapes is a
-            mesh or not upright.
+        InputError: The file is no SDF world, a pose or a model is placed by a frame that it names, the state scales a
+            model, the places of models are random, or one of the shapes is a mesh or not upright.
     """
     text = read_file(path)
     try:
@@ -41,6 +41,11 @@ def read_sdf(path: str | Path) -> Obstacles:
         placed = {
             model.get("name"): _pose(model) for model in world.iterfind("state/model") if model.find("pose") is not None
         }
+        if world.find("population") is not None:
+            raise InputError("has a <population>, whose models Gazebo places at random")
+        for model in world.iterfind("state/model"):
+            if (scale := model.findtext("scale")) and _finite(scale.split()) != [1.0, 1.0, 1.0]:
+                raise InputError(f"model {model.get('name')}: its state scales it by {scale}, which is not read")
         for model in world.iterfind("model"):
             name = model.get("name")
             shapes += _shapes(model, placed[name] if name in placed else _pose(model))
@@ -52,6 +57,8 @@ def read_sdf(path: str | Path) -> Obstacles:
 def _shapes(model: ElementTree.Element, base: Array) -> list[dict]:
     """Returns the obstacles of a model at its pose `(6,)`, and of the models in it."""
     found, name = [], f"model {model.get('name')}"
+    if frame := model.get("placement_frame"):
+        raise InputError(f"{name}: is placed by its frame {frame}, and such models are not read")
     for link in model.iterfind("link"):
         for collision in link.iterfind("collision"):
             found += _shape(collision, _after(_after(base, _pose(link)), _pose(collision)), name)

@@ -131,7 +131,8 @@ SDF = """<?xml version="1.0"?>
       <box><size>2 0.2 1</size></box></geometry></collision></link></model>
   <model name="floor"><link name="link"><collision name="c"><geometry>
       <box><size>20 20 0.01</size></box></geometry></collision></link></model>
-  <state world_name="default"><model name="unit_cylinder_1"><pose>-3 4 0.5 0 0 0</pose></model></state>
+  <state world_name="default"><model name="unit_cylinder_1"><scale>1 1 1</scale>
+    <pose>-3 4 0.5 0 0 0</pose></model></state>
 </world></sdf>
 """
 
@@ -176,6 +177,9 @@ def test_sdf_lintel(tmp_path):
         ("0.5 0 0 0", "0.5 1 0 0", "unit_cylinder_0: is not upright"),
         ("0.5 0 0 0", "0.5", "is not six numbers"),
         ("<pose>0.5", '<pose relative_to="door">0.5', "c: pose: is relative to door"),
+        ('name="wall">', 'name="wall" placement_frame="link">', "model wall: is placed by its frame link"),
+        ("<scale>1 1 1", "<scale>2 1 1", "model unit_cylinder_1: its state scales it by 2 1 1"),
+        ("</world>", '<population name="trees"/></world>', "has a <population>"),
         ("<radius>0.075</radius>", "", "cylinder has no valid radius"),
         ("<length>1</length>", "<length>1 m</length>", "cylinder has no valid length"),
         ("<length>1</length>", "", "cylinder has no valid length"),
