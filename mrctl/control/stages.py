@@ -49,7 +49,8 @@ class MotionStage(Protocol):
 
     It may have a member `followed`, a float64 array `(B, 7)`: the reference that it follows in place of the given one,
     in the same units. Its twist then passes the prefilter without lag, as that of the given one does otherwise. It is
-    read after each `output`, and None stands for the given one.
+    read after each `output`, and None stands for the given one. Until the next `output`, its twist changes at the rate
+    of its acceleration.
     """
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:

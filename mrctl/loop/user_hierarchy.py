@@ -127,6 +127,8 @@ class UserHierarchy(Hierarchy):
         elif self.motion_due:
             request_all(seen, reference, state)
         command_all(seen, reference if self._wanted is None else self._wanted, *constants, state)
+        if self._wanted is not None:
+            self._wanted["twist"] += self.period * self._wanted["acceleration"]
         feedback = self.stages.get("feedback")
         if feedback:
             self._feed_back(feedback, seen["twist"])
@@ -190,7 +192,7 @@ class UserHierarchy(Hierarchy):
         own = stage.member("followed")
         if own is not None:
             own = self._finite_rows(stage, stage.checked(own, (len(state), 7), "`followed`"))
-            own = reference = np.ascontiguousarray(own).view(reference.dtype)[:, 0]
+            own = reference = own.copy(order="C").view(reference.dtype)[:, 0]
         errors_of_all(seen, reference, state)
         state["correction"] = request - reference["twist"]
         return own

@@ -17,8 +17,8 @@ from mrctl.record import InputError
 from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
-TEMPERATURE = 0.05  # λ, in units of the cost; chosen
-ORDINARY_SPEED = 0.2  # m/s, largest V below which λ falls as V², as the costs by which the roll-outs differ do; chosen
+TEMPERATURE = 0.1  # λ, in units of the cost; chosen
+ORDINARY_SPEED = 0.4  # m/s, largest V below which λ falls as V², as the costs by which the roll-outs differ do; chosen
 MAX_COST_DIFFERENCE = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
 SHOWN_SAMPLES = 40  # of the samples, which are kept to be looked at
 SAMPLE_DEVIATIONS = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen

@@ -17,6 +17,7 @@ from mrctl.navigation.plan import Plan, least_clearance, run_out
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.sensing.lidar import Lidar
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines, Surroundings
 from mrctl.theory.references import MAX_COORDINATE, MIN_SPEED, Waypoints, check
@@ -35,6 +36,9 @@ PATIENCE, WAITING_PATIENCE = 2, 4
 PLAN_MARGIN = 0.05  # m, margin of a plan
 REPLAN_MARGIN = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
+# motion periods from a scan until a robot with `window` or `mppi` brakes: it waits for the next one, goes to another
+# twist in it, and lags
+REACTION_PERIODS = 3
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
 REACTIVE = "window", "mppi"
@@ -100,7 +104,8 @@ def prepared(
     Args:
         task: World, map, start and goal.
         scenario: As for `mrctl.navigation.mission.navigate`.
-        speed: Largest speed in m/s; by default 0.9 of the robot's.
+        speed: Largest speed in m/s; by default 0.9 of the robot's. With `window` and `mppi` it is at most
+            `speed_in_sight`.
         margin: Clearance that the plan keeps in m.
         avoid: What keeps the robot from obstacles that its map does not have.
         twist: V in m/s and θ̇ in rad/s with which the robot drives at its start.
@@ -110,6 +115,9 @@ def prepared(
     """
     check_avoid(avoid)
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
+    if reactive:
+        fastest = LIMIT_SHARE * vehicle.robot.max_speed if speed is None else speed
+        speed = min(fastest, speed_in_sight(vehicle, scenario.sensing.lidar))
     query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
     try:
         found, reference = planned(query, reverse=vehicle.reverses and not reactive, beyond=True)
@@ -128,6 +136,23 @@ def prepared(
             "prefilter": scenario.prefilter or shortest,
         }
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
+
+
+def speed_in_sight(vehicle: Vehicle, lidar: Lidar) -> float:
+    """Returns the largest speed in m/s from which a robot stops before what comes into the range of its lidar.
+
+    It drives on for a time t and then brakes: V t + V²/(2 a) = d, with d from its front to the end of the range.
+
+    Raises:
+        InputError: The lidar does not see beyond the robot.
+    """
+    front = float(vehicle.footprint[:, 0].max()) + REPLAN_MARGIN
+    way, late = lidar.x + lidar.range - front, 1 / lidar.rate + REACTION_PERIODS * REACTIVE_PERIOD
+    brakes = LIMIT_SHARE * vehicle.robot.max_acceleration
+    speed = brakes * (np.sqrt(late**2 + 2 * max(way, 0.0) / brakes) - late)
+    if speed < MIN_SPEED:
+        raise InputError(f"sensing.lidar.range: {lidar.range:g} m do not reach beyond the robot")
+    return float(speed)
 
 
 def planned(query: Query, *, reverse: bool = False, beyond: bool = False) -> tuple[Plan, Waypoints]:

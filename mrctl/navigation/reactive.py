@@ -257,7 +257,12 @@ class Reactive(ABC):
     robot is off its plan or waits. Where a robot waits that can reverse, and another plan is not found or does not
     help, it goes back a little on its `Trail`, and plans again.
 
+    What it chooses is the twist at the end of a motion period, to which the request goes in a straight line: a step
+    would be taken with the largest acceleration, and cost energy.
+
     Attributes:
+        followed: What the robots follow, as in `mrctl.control.stages.MotionStage`, `(B, 7)`: where they are, as they
+            have no place to be at a time, the last twist and its change.
         considered: What led to the last twist of each robot; None before the first one, and while it goes back.
     """
 
@@ -307,9 +312,12 @@ class Reactive(ABC):
         return np.stack([agent.last for agent in self._agents])
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """Returns twists that the robots can drive, `(B, 2)`; the arguments are those of `stages.MotionStage`."""
+        """Returns the last twists, `(B, 2)`, from which `followed` leads on to others that the robots can drive.
+
+        The arguments are those of `mrctl.control.stages.MotionStage`.
+        """
         self.begin(self._tick)
-        now = self._period * self._tick
+        now, last = self._period * self._tick, self.last
         for row, (agent, place) in enumerate(zip(self._agents, pose, strict=True)):
             agent.locate(place)
             if agent.stands(place, float(twist[row, 0]), now) or agent.goes_back(place, now):
@@ -319,7 +327,8 @@ class Reactive(ABC):
                 agent.last = self.choose(row, place, twist[row], agent.last, self._period, scene).copy()
                 agent.passes = bool(np.isfinite(agent.planner.blocked)) and self.passes(row, self._period, scene)
         self._tick += 1
-        return self.last
+        self.followed = np.column_stack([pose, last, (self.last - last) / self._period])
+        return last
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""

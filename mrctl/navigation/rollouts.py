@@ -2,8 +2,9 @@
 
 A roll-out integrates the unicycle from the pose of the robot over a horizon, and has a cost: squared distance and
 heading error from the plan, nearness to obstacles, and collision. Its twists are limited to what the robot can drive:
-forward, below its largest speed, rotation and curvature, and within its acceleration. They are obeyed at once, or with
-a first-order lag, τ dV/dt = V_requested − V, and the same for θ̇.
+forward, below its largest speed, rotation and curvature, and within its acceleration. What is requested goes from one
+twist to the next in a straight line, a step long. The robot obeys it at once, or with a first-order lag,
+τ dV/dt = V_requested − V, and the same for θ̇.
 """
 
 from __future__ import annotations
@@ -149,6 +150,26 @@ def enclosing_circle(discs: Array) -> tuple[float, float, float]:
 
 
 @kernel
+def followed(start: float, end: float, now: float, step: float, lag: float) -> tuple[float, float]:
+    """Returns the mean velocity of a robot over a step, and that at its end; V in m/s or θ̇ in rad/s, as all here.
+
+    Behind a request u + a t, with the lag τ, the velocity is u + a (t − τ) + (what it differs now + a τ) exp(−t/τ).
+
+    Args:
+        start: Request at the start of the step.
+        end: Request at its end, to which it goes in a straight line.
+        now: Velocity at the start of the step.
+        step: Duration of the step in s.
+        lag: τ in s; 0: the request is obeyed at once.
+    """
+    rest = np.exp(-step / lag) if lag > 0 else 0.0
+    share = lag / step
+    late = share * (end - start)
+    differs = now - start + late
+    return (start + end) / 2 - late + (1 - rest) * share * differs, end - late + rest * differs
+
+
+@kernel
 def roll_out(
     knots: Array, nominal: Array, pose: Array, twist: Array, last: Array, lag: float, step: float, bounds: Bounds,
     scene: Scene, worth: float, twists: Array, costs: Array,
@@ -182,9 +203,6 @@ def roll_out(
                 places[k, m, i] = movers[m, i] + k * step * movers[m, 2 + i]
     least = body_clearance(x, y, c, s, 0, circle, discs, distance, left, low, resolution, movers, places)
     least = least - MAX_DEEPER if least <= 0 else 0.0
-    # While a request is held, what is missing of it decays: to `rest` at the end of a step, to `mean` on its average.
-    rest = np.exp(-step / lag) if lag > 0 else 0.0
-    mean = (1 - rest) * lag / step
     before, shares = np.empty(steps, np.int64), np.empty(steps)  # knot before each step, and share of the one after it
     for k in range(steps):
         along = k * (knots.shape[1] - 1) / (steps - 1)
@@ -198,7 +216,7 @@ def roll_out(
             i, share = before[k], shares[k]
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
             turning = nominal[k, 1] + (1 - share) * knots[n, i, 1] + share * knots[n, i + 1, 1]
-            change = bounds.acceleration * step
+            from_v, from_omega, change = v, omega, bounds.acceleration * step
             fastest = max(bounds.speed, v - change)  # a robot on a slower way than before brakes
             v = min(max(min(max(wanted, v - change), v + change), 0.0), fastest)
             change = bounds.rotation_acceleration * step
@@ -208,8 +226,8 @@ def roll_out(
             twists[n, k, 0], twists[n, k, 1] = v, omega
             if judged:
                 continue
-            speed, rotation = v + mean * (drives - v), omega + mean * (turns - omega)
-            drives, turns = v + rest * (drives - v), omega + rest * (turns - omega)
+            speed, drives = followed(from_v, v, drives, step, lag)
+            rotation, turns = followed(from_omega, omega, turns, step, lag)
             # Half of the turn, the way, and the other half; the cosine of so small an angle is that of its series.
             half = rotation * step / 2
             ch, sh = 1 - half * half / 2 * (1 - half * half / 12), half * (1 - half * half / 6 * (1 - half * half / 20))

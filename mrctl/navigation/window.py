@@ -15,7 +15,7 @@ from mrctl.kernel import Array
 from mrctl.navigation.reactive import Reactive
 from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH_COST, Considered, Scene, roll_out
 
-SPEED_SAMPLES, ROTATION_SAMPLES = 9, 15  # of the window
+SPEED_SAMPLES, ROTATION_SAMPLES = np.linspace(-1, 1, 9), np.linspace(-1, 1, 15)  # of the window
 REACH_TIME = 0.25  # s, in which the twists of the window can be reached
 LOOK_STEPS = 12  # steps, over which a constant twist is looked at; chosen, like the next two
 # 1/s, `Scene.near`; with more a robot stops before gaps, as it comes nearer to its plan so slowly
@@ -32,11 +32,10 @@ class Window(Reactive):
         """Returns the first twist towards the best one of the window."""
         bounds = self.bounds[row]
         reach, turn = REACH_TIME * bounds.acceleration, REACH_TIME * bounds.rotation_acceleration
-        slowest = max(0.0, last[0] - reach)
-        speeds = np.linspace(slowest, max(slowest, min(bounds.speed, last[0] + reach)), SPEED_SAMPLES)
-        rotations = np.linspace(
-            max(-bounds.rotation, last[1] - turn), min(bounds.rotation, last[1] + turn), ROTATION_SAMPLES
-        )
+        # Their squares lie closest about the last twist: with even steps a robot swings from one to the next.
+        speeds = np.clip(last[0] + reach * SPEED_SAMPLES * abs(SPEED_SAMPLES), 0.0, bounds.speed)
+        rotations = last[1] + turn * ROTATION_SAMPLES * abs(ROTATION_SAMPLES)
+        rotations = np.clip(rotations, -bounds.rotation, bounds.rotation)
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
         ahead, costs = np.empty((len(grid), LOOK_STEPS, 2)), np.empty(len(grid))

@@ -5,7 +5,7 @@ import pytest
 from test_batch_equals_single import equal
 
 import mrctl
-from mrctl import Box, Disc, Event, Obstacles, Scenario, simulate
+from mrctl import Box, Disc, Event, InputError, Obstacles, Scenario, simulate
 from mrctl.loop.groups import arranged, uniform
 from mrctl.navigation import avoiders
 from mrctl.navigation.avoiders import avoiding
@@ -15,6 +15,7 @@ from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.planning import Avoid, Query, planned, prepared
 from mrctl.navigation.replanning import Planner
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
+from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.clearance import clearance, cover
@@ -59,7 +60,7 @@ def test_roll_out() -> None:
     verdicts = []
     for sample, cost in zip(twists, costs, strict=True):
         pose, free = np.zeros(3), np.inf
-        for k, (speed, turn) in enumerate(sample):
+        for k, (speed, turn) in enumerate((sample + np.vstack([last, sample[:-1]])) / 2):  # means over the steps
             middle = pose[2] + turn * 0.025
             pose = pose + 0.05 * np.array([speed * np.cos(middle), speed * np.sin(middle), turn])
             moved = Surroundings(
@@ -107,10 +108,10 @@ def test_lag() -> None:
     request[20:28] = np.linspace(last, request[-1], 9)[1:]  # as fast as the bounds allow
     pose, twist, targets = start.copy(), began.copy(), np.empty((STEPS, 4))
     for k in range(STEPS):
-        for _ in range(parts):
-            h = 0.05 / parts
+        for share in (np.arange(parts) + 0.5) / parts:  # of the way from one request to the next
+            h, before = 0.05 / parts, request[k - 1] if k else last
             pose += h * np.array([twist[0] * np.cos(pose[2]), twist[0] * np.sin(pose[2]), twist[1]])
-            twist += h * (request[k] - twist) / lag
+            twist += h * (before + share * (request[k] - before) - twist) / lag
         targets[k] = *pose[:2], np.cos(pose[2]), np.sin(pose[2])
     field = field_of(Surroundings(Obstacles()).at(0.0), np.array([-3.0, -3.0]), np.array([3.0, 3.0]), 0.1)
     scene = Scene(targets, cover(FOOTPRINT, 4), field, np.empty((0, 5)))
@@ -123,6 +124,19 @@ def test_lag() -> None:
     assert found[0] < 1e-5 and found[1] > 0.1 and found[2] > 0.01
     with pytest.raises(mrctl.InputError, match="^lag: "):
         Mppi(mrctl.load_robot("car"), 1, lambda *_: None, lag=-0.1)
+
+
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_smooth(avoid: Avoid) -> None:
+    """It costs no more energy to be led by an avoider than to keep a plan, whose time law has no steps at all."""
+    base = mrctl.Scenario.from_dict({"prior": "model", "learner": "composite"})
+    task, used = task_of("doorway:11", base), {}
+    for way in ("none", avoid):
+        mission = navigate(task, base, avoid=way)
+        steps = np.diff(mission.result["voltage_left"].values[0])
+        used[way] = float(mission.table["energy"].iloc[0]), float(np.sqrt(np.nanmean(steps**2)))
+    assert used[avoid][0] < used["none"][0]
+    assert used[avoid][1] < 3 * used["none"][1]  # V from tick to tick
 
 
 def test_crossing() -> None:
@@ -207,6 +221,24 @@ def test_dead_end(robot: str, avoid: Avoid) -> None:
     assert float(way_in["x"].max()) > 1.1 and float(abs(way_in["y"]).max()) < wide / 2 and found["clearance"] > 0.03
     back = -own.control_period * float(run["v"].where(run["v"] < 0, 0.0).sum())
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
+
+
+@pytest.mark.parametrize("seen", [0.6, 0.9, 1.3])
+def test_speed_in_sight(seen: float) -> None:
+    """A car drives no faster than it can stop before what comes into the range of its lidar."""
+    empty = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(3, 0, 0))
+    near = PLANNED.replace(sensing={"lidar": {"range": seen}})
+    plan = prepared(empty, near, avoid="window")[1].reference
+    robot, nose = Vehicle.of(near).robot, float(Vehicle.of(near).footprint[:, 0].max())
+    assert plan.speed * (0.1 + 0.15) + plan.speed**2 / (2 * 0.9 * robot.max_acceleration) == pytest.approx(
+        seen - nose - 0.02
+    )
+    far = prepared(empty, PLANNED, avoid="window")[1].reference
+    assert plan.speed < far.speed == pytest.approx(0.9 * robot.max_speed)
+    assert prepared(empty, near, avoid="none")[1].reference.speed == far.speed
+    assert prepared(empty, near, 0.1, avoid="mppi")[1].reference.speed == 0.1
+    with pytest.raises(InputError, match=r"^sensing.lidar.range: 0.4 m do not reach beyond the robot"):
+        prepared(empty, PLANNED.replace(sensing={"lidar": {"range": 0.4}}), avoid="mppi")
 
 
 @pytest.mark.parametrize(("turned", "plans"), [(0.15, 0), (0.25, 2)])

@@ -205,6 +205,29 @@ def test_followed():
     assert text.startswith("motion Short: `followed` is shape (3, 3), expected shape (3, 7)")
 
 
+def test_followed_between_calls():
+    """Until the next call the twist of what is followed changes at the rate of its acceleration."""
+
+    class Ramp:
+        def __init__(self, robot, size):
+            self.calls, self.before, self.kept = 0, 0, 0
+
+        def reset(self, pose, reference, period):
+            self.period = period
+
+        def output(self, pose, twist, reference):
+            now = np.column_stack([pose, np.tile([0.8 - 0.4 * self.period * self.calls, 0, -0.4, 0], (len(pose), 1))])
+            self.calls, self.followed = self.calls + 1, now
+            np.testing.assert_array_equal(self.before, self.kept)  # nobody writes to the stage's own array
+            self.before, self.kept = now, now.copy()
+            return now[:, 3:5]
+
+    line = {"reference": Line(length=1.0, speed=0.8), "motion_period": 0.05, "laps": 1}
+    found = simulate([s.replace(**line) for s in THREE], motion=Ramp)
+    command = found.v_command.values[:, :100]
+    np.testing.assert_allclose(command, np.tile(0.8 - 0.004 * np.arange(100), (3, 1)), atol=1e-12)
+
+
 def test_follow():
     """A motion controller with a method `follow` gets each new reference once, with the first sample of it."""
 
