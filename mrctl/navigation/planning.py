@@ -36,9 +36,9 @@ PATIENCE, WAITING_PATIENCE = 2, 4
 PLAN_MARGIN = 0.05  # m, margin of a plan
 REPLAN_MARGIN = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
-# motion periods from a scan until a robot with `window` or `mppi` brakes: it waits for the next one, goes to another
+# s from a scan until a robot brakes: with `window` and `mppi` it waits for the next motion period, goes to another
 # twist in it, and lags
-REACTION_PERIODS = 3
+REACTION_TIME = 3 * REACTIVE_PERIOD
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
 REACTIVE = "window", "mppi"
@@ -104,7 +104,7 @@ def prepared(
     Args:
         task: World, map, start and goal.
         scenario: As for `mrctl.navigation.mission.navigate`.
-        speed: Largest speed in m/s; by default 0.9 of the robot's. With `window` and `mppi` it is at most
+        speed: Largest speed in m/s; by default 0.9 of the robot's. With an avoider it is at most
             `speed_in_sight`.
         margin: Clearance that the plan keeps in m.
         avoid: What keeps the robot from obstacles that its map does not have.
@@ -115,7 +115,7 @@ def prepared(
     """
     check_avoid(avoid)
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
-    if reactive:
+    if avoid != "none":
         fastest = LIMIT_SHARE * vehicle.robot.max_speed if speed is None else speed
         speed = min(fastest, speed_in_sight(vehicle, scenario.sensing.lidar))
     query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
@@ -147,7 +147,7 @@ def speed_in_sight(vehicle: Vehicle, lidar: Lidar) -> float:
         InputError: The lidar does not see beyond the robot.
     """
     front = float(vehicle.footprint[:, 0].max()) + REPLAN_MARGIN
-    way, late = lidar.x + lidar.range - front, 1 / lidar.rate + REACTION_PERIODS * REACTIVE_PERIOD
+    way, late = lidar.x + lidar.range - front, 1 / lidar.rate + REACTION_TIME
     brakes = LIMIT_SHARE * vehicle.robot.max_acceleration
     speed = brakes * (np.sqrt(late**2 + 2 * max(way, 0.0) / brakes) - late)
     if speed < MIN_SPEED:

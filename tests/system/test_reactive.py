@@ -223,6 +223,15 @@ def test_dead_end(robot: str, avoid: Avoid) -> None:
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
 
 
+@pytest.mark.parametrize("avoid", AVOIDERS)
+def test_short_sight(avoid: Avoid) -> None:
+    """A car that sees no farther than 0.8 m stops before a wall that its map lacks."""
+    wall = Obstacles(shapes=(Box(x=2.8, length=0.1, width=20.0),))
+    task = Task(obstacles=wall, map=Obstacles(), start=(0, 0, 0), goal=(3.5, 0, 0))
+    driven = navigate(task, PLANNED.replace(sensing={"lidar": {"range": 0.8}}), avoid=avoid)
+    assert float(driven.result["x"].max()) > 2 and driven.table["outcome"].tolist() == ["stuck"]
+
+
 @pytest.mark.parametrize("seen", [0.6, 0.9, 1.3])
 def test_speed_in_sight(seen: float) -> None:
     """A car drives no faster than it can stop before what comes into the range of its lidar."""
@@ -236,6 +245,7 @@ def test_speed_in_sight(seen: float) -> None:
     far = prepared(empty, PLANNED, avoid="window")[1].reference
     assert plan.speed < far.speed == pytest.approx(0.9 * robot.max_speed)
     assert prepared(empty, near, avoid="none")[1].reference.speed == far.speed
+    assert prepared(empty, near, avoid="barrier")[1].reference.speed == plan.speed
     assert prepared(empty, near, 0.1, avoid="mppi")[1].reference.speed == 0.1
     with pytest.raises(InputError, match=r"^sensing.lidar.range: 0.4 m do not reach beyond the robot"):
         prepared(empty, PLANNED.replace(sensing={"lidar": {"range": 0.4}}), avoid="mppi")
