@@ -48,9 +48,9 @@ class MotionStage(Protocol):
     method, events that change the gains are refused.
 
     It may have a member `followed`, a float64 array `(B, 7)`: the reference that it follows in place of the given one,
-    in the same units. Its twist then passes the prefilter without lag, as that of the given one does otherwise. It is
-    read after each `output`, and None stands for the given one. Until the next `output`, its twist changes at the rate
-    of its acceleration.
+    in the same units. The twist of `followed` then passes the prefilter without lag, as that of the given one does
+    otherwise, and changes until the next `output` at the rate of the acceleration of `followed`. The member is read
+    after each `output`, and None stands for the given one.
     """
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:

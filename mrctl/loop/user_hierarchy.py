@@ -90,7 +90,7 @@ class UserHierarchy(Hierarchy):
         """Wires the user's stages, by name, and for the others those of the scenarios."""
         super().__init__(scenarios, robot, stages)
         self.feedforward_faults = [""] * len(scenarios)
-        self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
+        self._wanted: Rows | None = None  # reference of the user's motion controller
         self._new: dict[int, Reference] = {}  # references that it has not been told yet, by robot
         if (stage := stages.get("motion")) and stage.has("assign"):
             stage.ask("assign", tuple(scenarios))
@@ -128,7 +128,7 @@ class UserHierarchy(Hierarchy):
             request_all(seen, reference, state)
         command_all(seen, reference if self._wanted is None else self._wanted, *constants, state)
         if self._wanted is not None:
-            self._wanted["twist"] += self.period * self._wanted["acceleration"]
+            self._wanted["twist"] += self.period * self._wanted["acceleration"]  # of the next tick
         feedback = self.stages.get("feedback")
         if feedback:
             self._feed_back(feedback, seen["twist"])

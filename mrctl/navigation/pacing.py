@@ -142,13 +142,15 @@ class Pacer:
             reference: The plan at its clock, `(7,)`; out: the same at the pace.
             time: Time in s.
         """
-        before, twist = self._pace, reference[3:5].copy()
+        before, twist, tick = self._pace, reference[3:5].copy(), self._planner.scenario.control_period
         change = self._period * self._robot.max_acceleration / max(abs(float(twist[0])), 1e-9)
         self._pace = min(max(self._share(request, pose, time), before - change), before + BRAKING_SHARE * change, 1.0)
-        reference[3:5] = self._driven = self._pace * twist
+        # The twist goes on at the rate of its acceleration, and so gets to the new pace in the last control period.
+        start = self._pace - (1 - tick / self._period) * (self._pace - before)
+        reference[3:5], self._driven = start * twist, self._pace * twist
         reference[5:] = self._pace * self._pace * reference[5:] + (self._pace - before) / self._period * twist
         self._clock += self._pace
-        request *= self._pace
+        request *= start
 
     def _share(self, request: Array, pose: Array, time: float) -> float:
         """Returns the largest λ at a time in s that filter, way to where the plan is blocked, and a stop allow."""

@@ -36,8 +36,8 @@ PATIENCE, WAITING_PATIENCE = 2, 4
 PLAN_MARGIN = 0.05  # m, margin of a plan
 REPLAN_MARGIN = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
-# s from a scan until a robot brakes: with `window` and `mppi` it waits for the next motion period, goes to another
-# twist in it, and lags
+# s from a scan until a robot brakes, for all avoiders: with `window` and `mppi` the wait for the next motion period,
+# the change of the request over that period, and the lag of the robot
 REACTION_TIME = 3 * REACTIVE_PERIOD
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
@@ -115,10 +115,11 @@ def prepared(
     """
     check_avoid(avoid)
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
+    query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
+    query.check()
     if avoid != "none":
         fastest = LIMIT_SHARE * vehicle.robot.max_speed if speed is None else speed
-        speed = min(fastest, speed_in_sight(vehicle, scenario.sensing.lidar))
-    query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
+        query = query._replace(speed=min(fastest, speed_in_sight(vehicle, scenario.sensing.lidar)))
     try:
         found, reference = planned(query, reverse=vehicle.reverses and not reactive, beyond=True)
     except NoWay:
@@ -128,7 +129,7 @@ def prepared(
         raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING_PATIENCE
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
-    if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
+    if reactive:  # their request passes the prefilter without lag, unless a limit has acted
         tick = scenario.control_period
         shortest = max(tick, 0.01)  # s, that a scenario takes
         own |= {
@@ -139,19 +140,21 @@ def prepared(
 
 
 def speed_in_sight(vehicle: Vehicle, lidar: Lidar) -> float:
-    """Returns the largest speed in m/s from which a robot stops before what comes into the range of its lidar.
+    """Returns the largest speed in m/s from which a robot can stop before what stands where its lidar's range ends.
 
-    It drives on for a time t and then brakes: V t + V²/(2 a) = d, with d from its front to the end of the range.
+    It drives on for t, the time between two scans and `REACTION_TIME`, and brakes: V t + V²/(2 a) = d. The distance d
+    is that from `REPLAN_MARGIN` before its front to the end of the range, and a is 0.9 of its largest acceleration.
 
     Raises:
-        InputError: The lidar does not see beyond the robot.
+        InputError: That speed is less than a plan can have.
     """
     front = float(vehicle.footprint[:, 0].max()) + REPLAN_MARGIN
     way, late = lidar.x + lidar.range - front, 1 / lidar.rate + REACTION_TIME
     brakes = LIMIT_SHARE * vehicle.robot.max_acceleration
     speed = brakes * (np.sqrt(late**2 + 2 * max(way, 0.0) / brakes) - late)
     if speed < MIN_SPEED:
-        raise InputError(f"sensing.lidar.range: {lidar.range:g} m do not reach beyond the robot")
+        sees = f"with a range of {lidar.range:g} m and a rate of {lidar.rate:g} Hz"
+        raise InputError(f"sensing.lidar: {sees} the robot cannot stop within what it sees")
     return float(speed)
 
 

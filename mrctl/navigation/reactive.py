@@ -257,12 +257,13 @@ class Reactive(ABC):
     robot is off its plan or waits. Where a robot waits that can reverse, and another plan is not found or does not
     help, it goes back a little on its `Trail`, and plans again.
 
-    What it chooses is the twist at the end of a motion period, to which the request goes in a straight line: a step
-    would be taken with the largest acceleration, and cost energy.
+    It chooses the twist at the end of a motion period, and the request changes linearly up to it. The limiter would
+    turn a step into the largest acceleration, which costs energy.
 
     Attributes:
-        followed: What the robots follow, as in `mrctl.control.stages.MotionStage`, `(B, 7)`: where they are, as they
-            have no place to be at a time, the last twist and its change.
+        followed: What the robots follow, as in `mrctl.control.stages.MotionStage`, `(B, 7)`: the estimated pose, since
+            there is no reference pose in time, so that the guard sees no error of the posture; the requested twist at
+            the start of the period; and its rate of change over the period.
         considered: What led to the last twist of each robot; None before the first one, and while it goes back.
     """
 
@@ -312,9 +313,10 @@ class Reactive(ABC):
         return np.stack([agent.last for agent in self._agents])
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """Returns the last twists, `(B, 2)`, from which `followed` leads on to others that the robots can drive.
+        """Returns the requested twists at the start of the period, `(B, 2)`; `followed` leads to those just chosen.
 
-        The arguments are those of `mrctl.control.stages.MotionStage`.
+        These are within the bounds of the robots, except where a robot begins or ends its way back: there the limiter
+        acts. The arguments are those of `mrctl.control.stages.MotionStage`.
         """
         self.begin(self._tick)
         now, last = self._period * self._tick, self.last
@@ -348,7 +350,7 @@ class Reactive(ABC):
             row: Which robot.
             pose: x and y in m and θ in rad, `(3,)`.
             twist: The twist that it drives, as measured, V in m/s and θ̇ in rad/s, `(2,)`.
-            last: The twist that was requested in the last period, V in m/s and θ̇ in rad/s, `(2,)`.
+            last: The requested twist at the start of the period, V in m/s and θ̇ in rad/s, `(2,)`.
             period: Motion period in s, which is also a step of a roll-out.
             scene: What it sees.
         """

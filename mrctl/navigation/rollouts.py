@@ -2,9 +2,9 @@
 
 A roll-out integrates the unicycle from the pose of the robot over a horizon, and has a cost: squared distance and
 heading error from the plan, nearness to obstacles, and collision. Its twists are limited to what the robot can drive:
-forward, below its largest speed, rotation and curvature, and within its acceleration. What is requested goes from one
-twist to the next in a straight line, a step long. The robot obeys it at once, or with a first-order lag,
-τ dV/dt = V_requested − V, and the same for θ̇.
+forward, below its largest speed, rotation and curvature, and within its acceleration. The requested twist changes
+linearly over each step. The robot obeys it at once, or with a first-order lag, τ dV/dt = V_requested − V, and the same
+for θ̇.
 """
 
 from __future__ import annotations
@@ -79,9 +79,11 @@ class Considered(NamedTuple):
     pose: Array
     """Where the robot was by its estimate, x and y in m and θ in rad, `(3,)`."""
     twists: Array
-    """Some of the roll-outs, V in m/s and θ̇ in rad/s, `(k, n, 2)`."""
+    """Some of the roll-outs, V in m/s and θ̇ in rad/s at the ends of their steps, `(k, n, 2)`."""
     chosen: Array
-    """The one whose first twist was asked for, `(n, 2)`."""
+    """The one whose first twist is requested for the end of the period, `(n, 2)`."""
+    last: Array
+    """Requested twist at the start of the period, `(2,)`."""
 
     def paths(self, step: float) -> tuple[Array, Array]:
         """Returns the places on the ways of the roll-outs in m, `(k, n + 1, 2)`, and on the chosen one, `(n + 1, 2)`.
@@ -89,12 +91,14 @@ class Considered(NamedTuple):
         Args:
             step: Duration of a step in s.
         """
-        ways = [_path(self.pose, twists, step) for twists in (self.twists, self.chosen[None])]
+        ways = [_path(self.pose, self.last, twists, step) for twists in (self.twists, self.chosen[None])]
         return ways[0], ways[1][0]
 
 
-def _path(pose: Array, twists: Array, step: float) -> Array:
-    """Returns the places, `(k, n + 1, 2)`, of unicycles that obey twists, `(k, n, 2)`, at once: without the lag."""
+def _path(pose: Array, last: Array, ends: Array, step: float) -> Array:
+    """Returns the places, `(k, n + 1, 2)`, of unicycles that obey at once; `ends` as `Considered.twists`."""
+    starts = np.concatenate([np.broadcast_to(last, ends[:, :1].shape), ends[:, :-1]], axis=1)
+    twists = (starts + ends) / 2
     turned = step * np.cumsum(twists[..., 1], axis=-1)
     heading = pose[2] + turned - step * twists[..., 1] / 2  # half-way through each step
     moves = step * twists[..., :1] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
@@ -150,15 +154,16 @@ def enclosing_circle(discs: Array) -> tuple[float, float, float]:
 
 
 @kernel
-def followed(start: float, end: float, now: float, step: float, lag: float) -> tuple[float, float]:
-    """Returns the mean velocity of a robot over a step, and that at its end; V in m/s or θ̇ in rad/s, as all here.
+def lagged(start: float, end: float, now: float, step: float, lag: float) -> tuple[float, float]:
+    """Returns the mean velocity over a step, and that at its end, of a robot that follows a ramp with a lag.
 
-    Behind a request u + a t, with the lag τ, the velocity is u + a (t − τ) + (what it differs now + a τ) exp(−t/τ).
+    From v₀ on, the response to a request u + a t is u + a (t − τ) + (v₀ − u + a τ) exp(−t/τ). All velocities are V in
+    m/s, or θ̇ in rad/s.
 
     Args:
         start: Request at the start of the step.
-        end: Request at its end, to which it goes in a straight line.
-        now: Velocity at the start of the step.
+        end: Request at its end.
+        now: v₀, the velocity at the start of the step.
         step: Duration of the step in s.
         lag: τ in s; 0: the request is obeyed at once.
     """
@@ -181,14 +186,14 @@ def roll_out(
         nominal: Nominal twists, `(n, 2)`.
         pose: x and y in m and θ in rad, `(3,)`.
         twist: The twist that the robot drives, `(2,)`; matters only with a lag.
-        last: The twist that was requested in the last period, `(2,)`.
+        last: Requested twist at the start of the first step, `(2,)`.
         lag: Time constant with which the robot follows the requested twist in s; 0: at once.
         step: Duration of a step in s.
         bounds: What twists the robot can drive.
         scene: Plan and obstacles.
         worth: What a roll-out may cost more than the cheapest before it; one that costs more is not judged to its end,
             and its cost is what it was until then.
-        twists: Out: the twists of K roll-outs of n steps, `(K, n, 2)`.
+        twists: Out: the requested twists at the ends of the n steps of K roll-outs, `(K, n, 2)`.
         costs: Out: their costs, `(K,)`.
     """
     targets, discs, field, movers, end, near = scene
@@ -226,8 +231,8 @@ def roll_out(
             twists[n, k, 0], twists[n, k, 1] = v, omega
             if judged:
                 continue
-            speed, drives = followed(from_v, v, drives, step, lag)
-            rotation, turns = followed(from_omega, omega, turns, step, lag)
+            speed, drives = lagged(from_v, v, drives, step, lag)
+            rotation, turns = lagged(from_omega, omega, turns, step, lag)
             # Half of the turn, the way, and the other half; the cosine of so small an angle is that of its series.
             half = rotation * step / 2
             ch, sh = 1 - half * half / 2 * (1 - half * half / 12), half * (1 - half * half / 6 * (1 - half * half / 20))

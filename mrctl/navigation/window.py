@@ -32,7 +32,7 @@ class Window(Reactive):
         """Returns the first twist towards the best one of the window."""
         bounds = self.bounds[row]
         reach, turn = REACH_TIME * bounds.acceleration, REACH_TIME * bounds.rotation_acceleration
-        # Their squares lie closest about the last twist: with even steps a robot swings from one to the next.
+        # Signed squares lie closest about the last twist: between samples at equal distances a robot oscillates.
         speeds = np.clip(last[0] + reach * SPEED_SAMPLES * abs(SPEED_SAMPLES), 0.0, bounds.speed)
         rotations = last[1] + turn * ROTATION_SAMPLES * abs(ROTATION_SAMPLES)
         rotations = np.clip(rotations, -bounds.rotation, bounds.rotation)
@@ -58,5 +58,5 @@ class Window(Reactive):
         best = int(costs.argmin())
         hard = np.where(grid[:, 0, 0] == speeds[0], braking, np.inf)
         chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(hard.argmin())]
-        self.considered[row] = Considered(pose.copy(), ahead, chosen)
+        self.considered[row] = Considered(pose.copy(), ahead, chosen, last.copy())
         return chosen[0]
