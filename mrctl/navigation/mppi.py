@@ -18,7 +18,7 @@ from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
 TEMPERATURE = 0.1  # λ, in units of the cost; chosen
-ORDINARY_SPEED = 0.4  # m/s; for smaller largest V, λ falls as V², as the differences of the costs do; chosen
+ORDINARY_SPEED = 0.8  # m/s; for smaller largest V, λ falls as V², as the differences of the costs do; chosen
 MAX_COST_DIFFERENCE = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
 SHOWN_SAMPLES = 40  # of the samples, which are kept to be looked at
 SAMPLE_DEVIATIONS = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
