@@ -418,13 +418,15 @@ def test_avoiders(server, tmp_path, avoid):
     some, chosen = session.considered(0)
     stage, now = session._stages[0], session.log()[80, 0]
     assert np.allclose(some[:, 0], [now["x_measured"], now["y_measured"]], atol=0.02)  # it is predicted over the delay
-    pose, sampled, best = stage.considered[0]
+    pose, sampled, best, last = stage.considered[0]
     for way, twists in zip([*some[::10], chosen], [*sampled[::10], best], strict=True):
         x, y, theta = pose
-        for v, omega in np.repeat(twists, 50, axis=0):  # Euler, a millisecond each
+        steps, times = np.arange(len(twists) + 1.0), (np.arange(50.0 * len(twists)) + 0.5) / 50
+        requested = [np.interp(times, steps, ends) for ends in np.vstack([last, twists]).T]  # linear over each step
+        for v, omega in zip(*requested, strict=True):  # Euler, a millisecond each
             x, y, theta = x + 1e-3 * v * np.cos(theta), y + 1e-3 * v * np.sin(theta), theta + 1e-3 * omega
         assert way[-1] == pytest.approx([x, y], abs=3e-3)
-    assert np.hypot(*(chosen[1] - chosen[0])) == pytest.approx(0.05 * stage.last[0, 0])
+    assert np.hypot(*(chosen[1] - chosen[0])) == pytest.approx(0.05 * (last[0] + stage.last[0, 0]) / 2)
     assert np.ptp(some[:, -1, 1]) > {"window": 0.3, "mppi": 0.5}[avoid]  # over 0.6 s, and 2.8
     lines = live._scene.navigation._fans[0]
     assert all(drawn.visible for drawn in lines) and np.allclose(lines[1].points[0, 0, :2], chosen[0], atol=1e-6)
