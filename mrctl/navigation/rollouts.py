@@ -154,7 +154,7 @@ def enclosing_circle(discs: Array) -> tuple[float, float, float]:
 
 
 @kernel
-def lagged(start: float, end: float, now: float, step: float, lag: float) -> tuple[float, float]:
+def lagged(start: float, end: float, now: float, share: float, rest: float) -> tuple[float, float]:
     """Returns the mean velocity over a step, and that at its end, of a robot that follows a ramp with a lag.
 
     From v₀ on, the response to a request u + a t is u + a (t − τ) + (v₀ − u + a τ) exp(−t/τ). All velocities are V in
@@ -164,11 +164,9 @@ def lagged(start: float, end: float, now: float, step: float, lag: float) -> tup
         start: Request at the start of the step.
         end: Request at its end.
         now: v₀, the velocity at the start of the step.
-        step: Duration of the step in s.
-        lag: τ in s; 0: the request is obeyed at once.
+        share: τ over the duration of the step; 0: the request is obeyed at once.
+        rest: The exponential at the end of the step.
     """
-    rest = np.exp(-step / lag) if lag > 0 else 0.0
-    share = lag / step
     late = share * (end - start)
     differs = now - start + late
     return (start + end) / 2 - late + (1 - rest) * share * differs, end - late + rest * differs
@@ -208,6 +206,7 @@ def roll_out(
                 places[k, m, i] = movers[m, i] + k * step * movers[m, 2 + i]
     least = body_clearance(x, y, c, s, 0, circle, discs, distance, left, low, resolution, movers, places)
     least = least - MAX_DEEPER if least <= 0 else 0.0
+    rest = np.exp(-step / lag) if lag > 0 else 0.0
     before, shares = np.empty(steps, np.int64), np.empty(steps)  # knot before each step, and share of the one after it
     for k in range(steps):
         along = k * (knots.shape[1] - 1) / (steps - 1)
@@ -231,8 +230,8 @@ def roll_out(
             twists[n, k, 0], twists[n, k, 1] = v, omega
             if judged:
                 continue
-            speed, drives = lagged(from_v, v, drives, step, lag)
-            rotation, turns = lagged(from_omega, omega, turns, step, lag)
+            speed, drives = lagged(from_v, v, drives, lag / step, rest)
+            rotation, turns = lagged(from_omega, omega, turns, lag / step, rest)
             # Half of the turn, the way, and the other half; the cosine of so small an angle is that of its series.
             half = rotation * step / 2
             ch, sh = 1 - half * half / 2 * (1 - half * half / 12), half * (1 - half * half / 6 * (1 - half * half / 20))
