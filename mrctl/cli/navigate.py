@@ -57,7 +57,8 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
             known: Plan and localise on the map in this file, which may differ from the world and has one of the same
                 formats; by default the map has all that stands still in the world.
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
-            speed: Limit the plan to this speed in m/s; by default to 0.9 of the robot's largest.
+            speed: Limit the plan to this speed in m/s; by default to 0.9 of the robot's largest. With --avoid the plan
+                is never faster than lets the robot stop within the range of its lidar.
             margin: Keep this clearance in m in the plan.
             avoid: Law that keeps the robot from what its lidar sees beside the map, such as obstacles that move: none,
                 a filter that brakes (`barrier`), or a controller that follows the plan at its own pace and drives
