@@ -91,7 +91,12 @@ def steer(
 def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, robot: Row, s: Row) -> None:
     """Voltages and steering command within their limits, from feedback plus feedforward and the fork's angle.
 
-        U_r,l = U_Σ ± U_Δ
+        U_r,l = λ (U_Σ ± U_Δ),    λ = U_max / max(U_max, |U_Σ| + |U_Δ|)
+
+    Where a wheel needs more than the supply U_max, both voltages shrink by the same factor: a robot that cannot be as
+    fast as commanded keeps about the commanded curvature, because the steady speed of a motor is nearly proportional to
+    its voltage. If each voltage were cut by itself, two saturated motors would get the same one, and the robot would go
+    straight on, whatever θ̇ is commanded.
 
     - `compliant` and `caster`: U_Δ is the second channel.
     - `rigid`: the second channel is a θ̇ that the fork makes, and U_Δ is the electronic differential k_E N D θ̇/r plus
@@ -129,8 +134,9 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
     s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate
 
     left, right = s.feedback[0] + s.feedforward[0], s.feedback[1] + s.feedforward[1]
-    s.command[0] = max(-robot.supply, min(robot.supply, left))
-    s.command[1] = max(-robot.supply, min(robot.supply, right))
+    share = robot.supply / max(robot.supply, abs(left), abs(right))
+    s.command[0] = max(-robot.supply, min(robot.supply, share * left))  # the product may round up
+    s.command[1] = max(-robot.supply, min(robot.supply, share * right))
     lost_left, lost_right = s.command[0] - left, s.command[1] - right
     s.excess[0] = (lost_left + lost_right) / 2
     if not robot.rigid:

@@ -105,3 +105,33 @@ def test_run_says_so(output, tmp_path, monkeypatch, capsys):
     assert main(["run", "--laps", "1", *words]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("feedforward beyond"))
     assert line.endswith(f"from 0.00 s on: the guard limited it to {bound}")
+
+
+class Constant:
+    """Requests one twist all the time, whatever the reference is."""
+
+    twist = 0.0, 0.0
+
+    def __init__(self, robot, size):
+        self._request = np.tile(self.twist, (size, 1))
+
+    def reset(self, pose, reference, period):
+        pass
+
+    def output(self, pose, twist, reference):
+        return self._request
+
+
+@pytest.mark.parametrize("rotation", [0.1, 0.5, 1.0])
+def test_saturated_motors_turn(rotation):
+    """Under `all` a TurtleBot that is asked for 0.58 m/s reaches at most 0.48, and drives the arc that it is asked for.
+
+    If each voltage were cut by itself, it would drive straight on.
+    """
+    asked = type("Asked", (Constant,), {"twist": (0.58, rotation)})
+    heavy = Scenario(robot="turtlebot", learner="none", perturbation=mrctl.PERTURBATIONS["all"], laps=1)
+    result = mrctl.simulate(heavy.replace(reference=mrctl.Line(speed=0.5, length=4.0)), motion=asked)
+    steady = result.sel(time=slice(3.0, 4.5))  # later it is 1 m off the line
+    assert (steady["saturated"] == 1).all() and steady["v"].max() < 0.5
+    curvature = float(steady["omega"].mean() / steady["v"].mean())
+    assert curvature == pytest.approx(rotation / 0.58, rel=0.05)

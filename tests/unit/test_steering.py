@@ -169,11 +169,12 @@ def test_steering_limit(robot, stiff, rigid, twist, acceleration, feedback):
 
 @given(numbers(2, 40.0), numbers(2, 40.0), numbers(2, 1.0))
 def test_voltages(robot, feedback, feedforward, twist):
-    """U_r,l = U_Σ ± U_Δ limited to the supply; parts add up to what was asked, excess to what was cut."""
+    """U_r,l = U_Σ ± U_Δ, both smaller by the same factor where one is above the supply; excess is what that takes."""
     allocation = Allocation(robot)
     voltage = allocation(twist, feedback=feedback, feedforward=feedforward)[:2]
     asked = left_right(feedback + feedforward)
-    np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
+    np.testing.assert_allclose(voltage, asked * min(1.0, 24 / np.abs(asked).max(initial=1e-300)), atol=1e-12)
+    assert np.abs(voltage).max() <= 24
     np.testing.assert_allclose(allocation.parts, [*left_right(feedback), *left_right(feedforward)], atol=1e-12)
     np.testing.assert_allclose(allocation.excess, common_differential(voltage - asked), atol=1e-12)
     assert allocation.saturated == (np.abs(allocation.parts[:2] + allocation.parts[2:]) > 24).any()
@@ -191,7 +192,7 @@ def test_rigid_voltages(stiff, feedback, correction, feedforward, twist):
     expected = [feedback[0]] * 2 + [feedforward[0] - differential, feedforward[0] + differential]
     np.testing.assert_allclose(allocation.parts, expected, atol=1e-9)
     asked = allocation.parts[:2] + allocation.parts[2:]
-    np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
+    np.testing.assert_allclose(voltage, asked * min(1.0, 24 / np.abs(asked).max(initial=1e-300)), atol=1e-12)
     assert allocation.excess[0] == pytest.approx((voltage - asked).mean(), abs=1e-12)
     held = abs(allocation.angle) == stiff.steering_limit or (abs(twist[0]) <= HOLD_SPEED and allocation.excess[1] != 0)
     assert allocation.saturated == ((np.abs(asked) > 24).any() or held)
