@@ -274,6 +274,21 @@ def test_barrier_waits() -> None:
     assert table["outcome"].tolist() == ["arrived"] and table["clearance"].iloc[0] > 0.02
 
 
+def test_motors_too_weak_for_the_plan() -> None:
+    """A TurtleBot whose motors saturate leaves a plan that does not wait for it, and arrives along one that does.
+
+    Where each voltage was cut by itself, it hardly turned: with `barrier` it was stuck, and with `window` out of time.
+    """
+    weak = Scenario.from_dict({"robot": "turtlebot", "learner": "none", "perturbation": "all"})
+    task = task_of("doorway:3", weak)
+    assert navigate(task, weak).table["outcome"].tolist() == ["collided"]
+    for avoid in ("barrier", "window"):
+        driven = navigate(task, weak, avoid=avoid)
+        (row,) = driven.table.to_dict("records")
+        assert row["outcome"] == "arrived" and row["spl"] > 0.85
+        assert driven.result["saturated"].mean() > 0.3
+
+
 @pytest.mark.parametrize("tier", ["ideal", "field"])
 def test_idle_barrier(tier: str) -> None:
     """Where nothing is near the filter does not change a bit, whatever the delay of the sensors."""
