@@ -192,8 +192,8 @@ def test_control_period() -> None:
 
 def test_pace_between_calls() -> None:
     """With a motion period of five control periods the pace changes linearly: V exceeds neither the plan nor zero."""
-    wall = Obstacles(shapes=(Box(x=2.9, length=0.1, width=20.0),))
-    task = Task(obstacles=wall, map=Obstacles(), start=(0, 0, 0), goal=(3.6, 0, 0))
+    wall = Obstacles(shapes=(Box(x=2.9, length=0.1, width=3.0),))
+    task = Task(obstacles=wall, map=Obstacles(), start=(0, 0, 0), goal=(5, 0, 0))
     driven = navigate(task, PLANNED.replace(motion_period=0.05), avoid="barrier")
     command = driven.result["v_command"].values[0]
     assert 1.353 > np.nanmax(command) > 1 and np.nanmin(command) > -0.01  # m/s; the plan has 1.35
