@@ -93,13 +93,15 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
 
         U_r,l = λ (U_Σ ± U_Δ)
 
-    - `compliant` and `caster`: U_Δ is the second channel, and λ = U_max / max(U_max, |U_Σ| + |U_Δ|). Where a wheel
-      needs more than the supply U_max, both voltages shrink by the same factor: a robot that cannot be as fast as
-      commanded keeps about the commanded curvature, because the steady speed of a motor is nearly proportional to its
-      voltage. If each voltage were cut by itself, two saturated motors would get the same one, and the robot would go
-      straight on, whatever θ̇ is commanded.
+    - `compliant` and `caster`: U_Δ is the second channel.
     - `rigid`: the second channel is a θ̇ that the fork makes, and U_Δ is the electronic differential k_E N D θ̇/r plus
-      half the difference of the friction terms of the two drives. Here λ is 1, and each voltage is cut by itself.
+      half the difference of the friction terms of the two drives.
+
+    A steered wheel turns the robot also where the motors saturate. Then λ is 1, and each voltage is cut at the supply
+    U_max by itself, which keeps the most of V. Where the motors alone turn it, λ = U_max / max(U_max, |U_Σ| + |U_Δ|): a
+    robot that cannot be as fast as commanded keeps about the commanded curvature, because the steady speed of a motor
+    is nearly proportional to its voltage. Cut one by one, two saturated motors would get the same voltage, and the
+    robot would go straight on, whatever θ̇ is commanded.
 
     Args:
         twist: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
@@ -133,7 +135,7 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
     s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate
 
     left, right = s.feedback[0] + s.feedforward[0], s.feedback[1] + s.feedforward[1]
-    share = 1.0 if robot.rigid else robot.supply / max(robot.supply, abs(left), abs(right))
+    share = robot.supply / max(robot.supply, abs(left), abs(right)) if robot.free else 1.0
     s.command[0] = max(-robot.supply, min(robot.supply, share * left))  # the product may round up
     s.command[1] = max(-robot.supply, min(robot.supply, share * right))
     lost_left, lost_right = s.command[0] - left, s.command[1] - right

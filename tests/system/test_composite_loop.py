@@ -89,8 +89,8 @@ def test_unknown_delay():
     learning = late.replace(learner="composite")
     eager = learning.replace(composite=IDEAL["composite"])
     cases = late, learning, eager, eager.replace(pid=Pid())
-    last = per_lap(simulate([run for case in cases for run in replicates(case, 8)])).isel(lap=-1)
-    turn, position = (last[name].values.reshape(4, 8).mean(axis=1) for name in ("omega_rmse", "position_rmse"))
+    last = per_lap(simulate([run for case in cases for run in replicates(case, 4)])).isel(lap=-1)
+    turn, position = (last[name].values.reshape(4, 4).mean(axis=1) for name in ("omega_rmse", "position_rmse"))
     assert turn[1] < 3 * turn[0] and position[1] < 1.2 * position[0]
     assert turn[2] > 5 * turn[1] and position[2] > 1.3 * position[1]
     assert turn[3] < turn[2] / 2 and position[3] < position[2]

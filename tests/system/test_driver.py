@@ -42,16 +42,13 @@ def limited(feedforward, amperes, period, laps, seeds, told, guard=False):
 
 
 def test_least_squares_under_a_limit():
-    """2.2 A are too few for the first lap of `rls`. Not told, it learns from voltages that never acted, and is lost.
-
-    Told, it is lost less often, and with the guard, which hardly acts, never.
-    """
-    untold, _ = limited("rls", 2.2, 10.0, 4, range(10), told=False)
-    told, _ = limited("rls", 2.2, 10.0, 4, range(10), told=True)
-    kept = told[np.isfinite(told)]
-    assert np.isinf(untold).sum() > np.isinf(told).sum() and len(kept) >= 8 and kept.max() < 1.5
-    error, guarded = limited("rls", 2.2, 10.0, 4, range(10), told=True, guard=True)
-    assert error.max() < 1.5 and guarded.max() < 0.05
+    """2.2 A are too few for the first lap of `rls`. Not told, it learns from voltages that never acted, and is lost."""
+    untold, _ = limited("rls", 2.2, 10.0, 4, range(5), told=False)
+    assert untold.max() > 15
+    told, _ = limited("rls", 2.2, 10.0, 4, range(5), told=True)
+    assert told.max() < 1.5
+    _, guarded = limited("rls", 2.2, 10.0, 4, range(5), told=True, guard=True)
+    assert guarded.max() < 0.05
 
 
 @pytest.mark.parametrize("feedforward", ["none", "fel"])

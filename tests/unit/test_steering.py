@@ -167,13 +167,18 @@ def test_steering_limit(robot, stiff, rigid, twist, acceleration, feedback):
         assert abs(allocation.angle) <= robot.steering_limit
 
 
+@pytest.mark.parametrize("stiffness", [0.0, 20.0])
 @given(numbers(2, 40.0), numbers(2, 40.0), numbers(2, 1.0))
-def test_voltages(robot, feedback, feedforward, twist):
-    """U_r,l = U_Σ ± U_Δ, both smaller by the same factor where one is above the supply; excess is what that takes."""
-    allocation = Allocation(robot)
+def test_voltages(robot, stiffness, feedback, feedforward, twist):
+    """U_r,l = U_Σ ± U_Δ within the supply; excess is what that takes.
+
+    Without a servo both shrink by the same factor where one is above the supply; with one, each is cut by itself.
+    """
+    allocation = Allocation(robot.model_copy(update={"steering_stiffness": stiffness}))
     voltage = allocation(twist, feedback=feedback, feedforward=feedforward)[:2]
     asked = left_right(feedback + feedforward)
-    np.testing.assert_allclose(voltage, asked * min(1.0, 24 / np.abs(asked).max(initial=1e-300)), atol=1e-12)
+    shrunk = asked * min(1.0, 24 / np.abs(asked).max(initial=1e-300))
+    np.testing.assert_allclose(voltage, np.clip(asked, -24, 24) if stiffness else shrunk, atol=1e-12)
     assert np.abs(voltage).max() <= 24
     np.testing.assert_allclose(allocation.parts, [*left_right(feedback), *left_right(feedforward)], atol=1e-12)
     np.testing.assert_allclose(allocation.excess, common_differential(voltage - asked), atol=1e-12)
