@@ -19,7 +19,7 @@ NOMINAL = np.dtype(
         ("max_twist", "f8", 2),  # largest |V| and |θ̇|, m/s and rad/s
         ("max_acceleration", "f8", 2),  # largest |V̇| and |θ̈|, m/s² and rad/s²
         ("rigid", "?"),  # whether the second channel is steering
-        ("free", "?"),  # whether nothing but the difference of the motors turns the robot
+        ("motors_steer", "?"),  # whether only the difference of the motors' voltages turns the robot
     ],
     align=True,
 )
@@ -38,5 +38,5 @@ def nominal(robot: Robot, rigid: bool) -> Rows:
     record["emf"], record["loss"] = robot.back_emf / robot.wheel_radius, robot.drive_loss / robot.motor_gain
     record["max_twist"] = robot.max_speed, robot.max_rotation
     record["max_acceleration"] = robot.max_acceleration, robot.max_rotation_acceleration
-    record["rigid"], record["free"] = rigid, not rigid and robot.steering_stiffness == 0
+    record["rigid"], record["motors_steer"] = rigid, not rigid and robot.steering_stiffness == 0
     return record

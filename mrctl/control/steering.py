@@ -135,7 +135,7 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
     s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate
 
     left, right = s.feedback[0] + s.feedforward[0], s.feedback[1] + s.feedforward[1]
-    share = robot.supply / max(robot.supply, abs(left), abs(right)) if robot.free else 1.0
+    share = robot.supply / max(robot.supply, abs(left), abs(right)) if robot.motors_steer else 1.0
     s.command[0] = max(-robot.supply, min(robot.supply, share * left))  # the product may round up
     s.command[1] = max(-robot.supply, min(robot.supply, share * right))
     lost_left, lost_right = s.command[0] - left, s.command[1] - right

@@ -282,7 +282,7 @@ def test_motors_too_weak_for_the_plan() -> None:
     weak = Scenario.from_dict({"robot": "turtlebot", "learner": "none", "perturbation": "all"})
     task = task_of("doorway:3", weak)
     assert navigate(task, weak).table["outcome"].tolist() == ["collided"]
-    for avoid in ("barrier", "window"):
+    for avoid in ("barrier", "window", "mppi"):
         driven = navigate(task, weak, avoid=avoid)
         (row,) = driven.table.to_dict("records")
         assert row["outcome"] == "arrived" and row["spl"] > 0.85
