@@ -1,7 +1,8 @@
-"""A plan in time whose clock the braking filter slows: the motion stage `barrier` of missions.
+"""A plan in time whose clock waits for the braking filter and for the robot: the motion stage `barrier` of missions.
 
 A robot that follows a plan in time is not helped by the nearest twist that `barrier_filter` allows: the plan goes on
-without it, and its controller then asks for a way across obstacles. `Pacing` therefore slows the plan itself.
+without it, and its controller then asks for a way across obstacles. The same holds for a robot whose motors are too
+weak for the plan. `Pacing` therefore slows the plan itself.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ STANDING_MARGIN, MOVING_MARGIN = 0.02, 0.1
 # m, for errors of tracking: by so much the margin from the map is at least below that of the plan
 TRACKING_MARGIN = 0.01
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
+CATCH_UP_SPEED = 0.1  # m/s, by which a robot that lags drives faster than the plan at most; chosen
 MIN_PACE = 0.1  # mean λ over the time HEADWAY_TIME, below which a robot makes no headway; chosen
 
 
@@ -144,7 +146,8 @@ class Pacer:
         """
         before, twist, tick = self._pace, reference[3:5].copy(), self._planner.scenario.control_period
         change = self._period * self._robot.max_acceleration / max(abs(float(twist[0])), 1e-9)
-        self._pace = min(max(self._share(request, pose, time), before - change), before + BRAKING_SHARE * change, 1.0)
+        wanted = self._share(request, pose, twist, time)
+        self._pace = min(max(wanted, before - change), before + BRAKING_SHARE * change, 1.0)
         # The twist goes on at the rate of its acceleration, and so gets to the new pace in the last control period.
         start = self._pace - (1 - tick / self._period) * (self._pace - before)
         reference[3:5], self._driven = start * twist, self._pace * twist
@@ -152,9 +155,11 @@ class Pacer:
         self._clock += self._pace
         request *= start
 
-    def _share(self, request: Array, pose: Array, time: float) -> float:
-        """Returns the largest λ at a time in s that filter, way to where the plan is blocked, and a stop allow."""
+    def _share(self, request: Array, pose: Array, twist: Array, time: float) -> float:
+        """Returns the largest λ at a time in s for the filter, the lag, the way to where it is blocked, and a stop."""
         sight, found = self._planner.sight, 0.0 if self._stops else 1.0
+        if request[0] * twist[0] > 0:
+            found = min(found, float((abs(twist[0]) + CATCH_UP_SPEED) / abs(request[0])))
         if np.isfinite(self._place):
             part = self._plan[int(self._clock) : int(self._place), 3]
             left = self._period * float(np.abs(part).sum()) - STANDOFF
@@ -221,7 +226,7 @@ class Pacer:
 
 
 class Pacing:
-    """A motion stage that follows plans with Kanayama's law, and slows the clock of a plan where the filter asks.
+    """A motion stage that follows plans with Kanayama's law, at a pace that the filter allows and the robot can keep.
 
     With the clock s of the plan, the request u(s) of Kanayama's law, and the largest λ ≤ 1 for which λ u is allowed,
 
@@ -230,6 +235,10 @@ class Pacing:
     (path-velocity decomposition: Kant and Zucker, "Toward efficient trajectory planning", IJRR 5(3), 1986). The robot
     drives the curvature that the plan asks for, and in the time s its error of posture obeys the same equations as
     without obstacles. λ changes no faster than the robot can follow.
+
+    A robot that does not get to the speed of the plan lags, and the request grows with the lag. Where the request is
+    faster than the plan by more than v = `CATCH_UP_SPEED`, λ is at most (|V_r| + v) / |V(s)|: the request λ V(s) keeps
+    to the speed of the plan, which brakes in time, and the clock goes at the rate of the robot.
 
     Where something that stands and is not on the map blocks the plan, the robot drives on along another plan that
     begins with about its speed. If there is none, it stops `STANDOFF` before that place, and makes a plan there. Where

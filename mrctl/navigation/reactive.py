@@ -122,10 +122,13 @@ class Agent:
         last = len(self._table) - 1
         places = self._place + SAMPLES_PER_PERIOD * np.arange(1, STEPS + 1)
         targets, end = self._table[np.minimum(places, last)], 1 + int(np.searchsorted(places, last))
+        return Scene(targets, self._discs, self._field, self._near(pose, now), end)
+
+    def _near(self, pose: Array, now: float) -> Array:
+        """Returns the discs beside the map that the robot could meet on its roll-outs, `(M, 5)` as of `Sight.discs`."""
         found, horizon = self.planner.sight.discs(now), self._period * STEPS
         far = self._reach + horizon * (self.bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
-        near = found[np.hypot(*(found[:, :2] - pose[:2]).T) < far]
-        return Scene(targets, self._discs, self._field, near, end)
+        return found[np.hypot(*(found[:, :2] - pose[:2]).T) < far]
 
     def stands(self, pose: Array, speed: float, now: float) -> bool:
         """Tells whether it arrived at the end of its plan a while ago; then it rests there until something moves it.
@@ -177,7 +180,7 @@ class Agent:
         # Before it goes back, it is stuck also where the plan that it got here did not help it.
         stuck = other is None if self._pieces else near and waits and (other is None or self._replanned)
         self._replanned = near and waits
-        if stuck and self._may_go_back(now):
+        if stuck and self._may_go_back(pose, now):
             self._approached |= self._near_end
             self._pieces = self._pieces + 1 if self._back(pose, now) else 0
         else:
@@ -217,9 +220,9 @@ class Agent:
         """Whether its place on the plan is the last one."""
         return self._place > len(self._table) - 1 - SAMPLES_PER_PERIOD
 
-    def _may_go_back(self, now: float) -> bool:
-        """Tells whether it could go back a piece: not where what moves may let it pass, nor twice from a goal."""
-        can = self.planner.vehicle.reverses and not len(self.planner.sight.moving(now).discs)
+    def _may_go_back(self, pose: Array, now: float) -> bool:
+        """Tells whether it could go back a piece: not where what moves near it may give way, nor twice from a goal."""
+        can = self.planner.vehicle.reverses and not self._near(pose, now)[:, 2:4].any()
         return can and self._pieces < MAX_BACK_PIECES and not (self._near_end and self._approached)
 
     def _back(self, pose: Array, now: float) -> bool:

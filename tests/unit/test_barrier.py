@@ -18,7 +18,7 @@ from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.barrier import Barrier, approach, share
 from mrctl.navigation.barrier_filter import Avoiding, avoid, nearest
-from mrctl.navigation.pacing import Following, Pacer, Pacing
+from mrctl.navigation.pacing import CATCH_UP_SPEED, Following, Pacer, Pacing
 from mrctl.navigation.replanning import Planner
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
@@ -251,6 +251,32 @@ def test_paced_plan_is_driven_whole() -> None:
     assert ticks > 1.02 * plan.period / period
 
 
+@pytest.mark.parametrize(("limit", "cusps"), [(0.9, ()), (0.5, ()), (0.5, (0,))])
+def test_plan_waits_for_a_slow_robot(limit: float, cusps: tuple[int, ...]) -> None:
+    """The clock goes at the rate of a robot slower than its plan, forward and in reverse, whose lag is as derived.
+
+    In the steady state the clock has the rate λ = V_max / V_r, and the request is λ (V_r + k_x e) = V_r + v.
+    """
+    plan = Waypoints(points=((0, 0), (8, 0)), closed=False, timing="limits", speed=1.2, cusps=cusps)
+    scenario, k_x, period, pose = Scenario(reference=plan, prior="model"), 8.0, 0.01, np.zeros((1, 3))
+    pose[0] = plan.sample(np.zeros(1)).pose[0]
+    stage = Pacing(mjcf.build()[1], 1, lambda *_: None)
+    stage.assign([scenario])
+    stage.tune(0, Kanayama(k_x=k_x, k_y=12.0, k_theta=4.0))
+    stage.reset(pose, np.zeros((1, 7)), period)
+    lags, rates, ticks = [], [], 0
+    while pose[0, 0] < 7.99:
+        request = stage.output(pose, np.zeros((1, 2)), np.zeros((1, 7)))[0]
+        lags.append(stage.followed[0, 0] - pose[0, 0])
+        rates.append(abs(stage.followed[0, 3]))
+        pose[0, 0] += period * np.cos(pose[0, 2]) * np.clip(request[0], -limit, limit)
+        ticks += 1
+        assert ticks < 2000
+    middle = slice(ticks // 3, ticks // 2)
+    np.testing.assert_allclose(rates[middle], limit, rtol=2e-3)
+    np.testing.assert_allclose(lags[middle], ((1.2 + CATCH_UP_SPEED) * 1.2 / limit - 1.2) / k_x, rtol=0.02)
+
+
 def test_stop_for_a_shorter_way() -> None:
     """A robot that stops does so also where its plan is blocked far ahead."""
     plan = Waypoints(points=((0, 0), (4, 0), (8, 0)), closed=False, timing="limits", speed=1.2)
@@ -258,9 +284,9 @@ def test_stop_for_a_shorter_way() -> None:
     pacer = Pacer(Planner.each(lambda *_: None, [scenario])[0], mjcf.build()[1], 0.01)
     request, pose = np.array([1.0, 0.0]), np.zeros(3)
     pacer._place = 500.0
-    assert pacer._share(request, pose, 0.0) == 1
+    assert pacer._share(request, pose, request, 0.0) == 1
     pacer._stops = True
-    assert pacer._share(request, pose, 0.0) == 0
+    assert pacer._share(request, pose, request, 0.0) == 0
 
 
 def test_wrapped_stage_sees() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import Disc, InputError, Obstacles, Scenario
+from mrctl import Disc, InputError, Obstacles, RobotFile, Scenario
 from mrctl.navigation import hybrid_astar
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.hybrid_astar import NoWay
@@ -12,6 +12,7 @@ from mrctl.navigation.replanning import Planner
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
+from mrctl.navigation.window import Window
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import Waypoints
 
@@ -161,3 +162,28 @@ def test_speed_of_the_way() -> None:
     assert before is not None and before.speed == 1.0 and after is not None
     times = np.linspace(0.0, after.period, 200)
     assert after.sample(times).twist[:, 0].max() == pytest.approx(0.3, rel=0.02)
+
+
+@pytest.mark.parametrize(("away", "goes_back"), [(1.5, False), (20.0, True), (None, True)])
+def test_goes_back_unless_something_moves_near(away: float | None, goes_back: bool) -> None:
+    """A TurtleBot that cannot pass goes back the way that it came, but waits where it could meet what moves."""
+    plan = Waypoints(points=((0, 0), (3, 0)), closed=False, timing="limits", speed=0.5)
+    scenario = Scenario(robot=RobotFile(path="turtlebot"), reference=plan, prior="model", motion_period=0.05)
+    stage = Window(Vehicle.of(scenario).robot, 1, lambda *_: None)
+    stage.assign([scenario])
+    pose, period, speeds = np.zeros((1, 3)), scenario.motion_period, []
+    stage.reset(pose, np.zeros((1, 7)), period)
+    (planner,) = stage._planners
+    planner.sight = seen = Seen(Obstacles())
+    seen.show(*((1.0, y / 20) for y in range(-40, 41)))  # a wall
+    if away is not None:
+        seen._found = np.vstack([seen._found, (-away, 0.5, 0.2, 0.0, 0.0)])
+    twist = np.zeros((1, 2))
+    for _ in range(round(6.0 / period)):
+        planner.looked = True
+        twist = stage.output(pose, twist, np.zeros((1, 7)))
+        c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+        pose = pose + period * np.array([[twist[0, 0] * c, twist[0, 0] * s, twist[0, 1]]])
+        speeds.append(twist[0, 0])
+        seen._found[len(seen.standing.discs) :, 4] += period  # what moves stays in its place
+    assert (min(speeds) < -0.1) == goes_back and 0.4 < max(speeds)
