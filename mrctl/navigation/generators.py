@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,8 @@ def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, c
     _positive(cell=cell)
     _whole(0, seed=seed, steps=steps)
     _whole(1, cells=cells)
-    if not 0 <= fill <= 1:
-        raise InputError(f"fill: must be between 0 and 1, not {fill:g}")
+    if not (isinstance(fill, Real) and 0 <= fill <= 1):
+        raise InputError(f"fill: must be between 0 and 1, not {fill!r}")
     filled = np.random.default_rng(seed).random((cells, cells)) < fill
     for _ in range(steps):
         neighbours = _neighbours(filled)
@@ -95,7 +95,9 @@ def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, 
     _positive(width=width, length=length)
     _whole(0, seed=seed)
     _whole(1, pieces=pieces)
-    if not 0 <= turn < np.pi / 2 or (width / 2 + WALL_THICKNESS) * np.tan(turn / 2) >= length / 2:
+    if not (isinstance(turn, Real) and 0 <= turn < np.pi / 2):
+        raise InputError(f"turn: must be between 0 and π/2 rad, not {turn!r}")
+    if (width / 2 + WALL_THICKNESS) * np.tan(turn / 2) >= length / 2:
         raise InputError(f"turn: pieces of {length:g} m that are {width:g} m wide cannot bend by {turn:g} rad")
     headings, middle, mitre = bent_line(seed, pieces, length, turn)
     walls = []
@@ -247,6 +249,8 @@ def warehouse(
     Raises:
         InputError: A size is not positive, or the seed or a number is not whole.
     """
+    if not (isinstance(shelf, Sequence) and len(shelf) == 2):
+        raise InputError(f"shelf: must be a length and a width in m, not {shelf!r}")
     _positive(aisle=aisle, length=shelf[0], width=shelf[1])
     _whole(0, seed=seed)
     _whole(1, rows=rows, columns=columns)
@@ -277,14 +281,14 @@ def _task(shapes: Sequence[Obstacle], start: Sequence[float], goal: Sequence[flo
 
 
 def _positive(**values: float) -> None:
-    """Refuses values that are not positive.
+    """Refuses values that are not positive and finite.
 
     Raises:
         InputError: One is not; the message names it.
     """
     for name, value in values.items():
-        if not value > 0:
-            raise InputError(f"{name}: must be positive, not {value}")
+        if not (isinstance(value, Real) and 0 < value < np.inf):
+            raise InputError(f"{name}: must be a positive number, not {value!r}")
 
 
 def _whole(least: int, **values: int) -> None:

@@ -268,6 +268,26 @@ def test_impossible_worlds(make):
 @pytest.mark.parametrize(
     ("make", "name"),
     [
+        (lambda: generators.doorway("a"), "width"),
+        (lambda: generators.doorway(0.8, room=float("inf")), "room"),
+        (lambda: generators.parking_bay(float("nan"), 0.6), "length"),
+        (lambda: generators.slalom(None), "gap"),
+        (lambda: generators.corridor(1.0, turn="right"), "turn"),
+        (lambda: generators.cellular(1, fill="half"), "fill"),
+        (lambda: generators.warehouse(1.0, shelf=(2.0,)), "shelf"),
+        (lambda: generators.warehouse(1.0, shelf=2.0), "shelf"),
+        (lambda: generators.warehouse(1.0, shelf=(2.0, -0.5)), "width"),
+    ],
+)
+def test_sizes_that_are_no_sizes(make, name):
+    """What is not a positive number, or a pair of them, is refused by its name."""
+    with pytest.raises(InputError, match=f"^{name}: must be"):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
         *((make, "seed") for make in TASKS.values()),
         (lambda _: generators.cellular(1, steps=-1), "steps"),
         (lambda _: generators.cellular(1, cells=4.5), "cells"),
