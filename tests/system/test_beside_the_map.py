@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mrctl import Box, Disc, InputError, Line, Obstacles, Scenario, simulate
+from mrctl.experiments.mission_suite import PLANTS
 from mrctl.experiments.three_mppis import ended, world
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
@@ -123,6 +124,29 @@ def test_still(robot: str, avoid: Avoid, count: int) -> None:
     """Where the map is right the filter only slows the robots, and all arrive."""
     found, times = driven("still", robot, avoid, count)
     assert found == {"arrived": sum(found.values())} and np.mean(times) < 2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("robot", "plant"), [("turtlebot", "all"), ("racecar", "sagging battery")])
+def test_still_with_weak_motors(robot: str, plant: str) -> None:
+    """A plan waits for motors that are too weak for it: all arrive, and few run past the goal by more than 10 cm."""
+    past = []
+    for seed in range(FIRST, FIRST + 20):
+        own = {"prior": "model", "learner": "composite", "robot": {"path": robot}, "seed": seed}
+        scenario = Scenario.from_dict(own)
+        try:
+            task = still(scenario, seed)
+            plan, drive = prepared(task, scenario, avoid="barrier")
+        except InputError:
+            continue
+        result = simulate(replicates(drive.replace(perturbation=PLANTS[plant]), 1, seed), motion=avoiding("barrier"))
+        assert outcomes(result, task.goal, plan)["outcome"].tolist() == ["arrived"]
+        (x, y, theta), run = task.goal, result.isel(run=0)
+        ahead = (run["x"] - x) * np.cos(theta) + (run["y"] - y) * np.sin(theta)
+        past.append(float(ahead.where(np.hypot(run["x"] - x, run["y"] - y) < 0.6).max()))
+    median, most = np.quantile(past, (0.5, 0.9))
+    print(f"\nstill, {robot}, {plant}: {len(past)} arrive; {median:.3f} m past the goal, at most {max(past):.3f} m")
+    assert len(past) > 15 and median < 0.08 and most < 0.12
 
 
 @pytest.mark.parametrize(
