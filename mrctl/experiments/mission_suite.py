@@ -246,7 +246,7 @@ def critical_widths(found: Found, shown: str) -> Table:
         for name, one in zip(CONTROLLERS, own, strict=True):
             there = int(np.isfinite(one).sum())
             share = share_cell(there, len(one))
-            rows.append([plant, titled(name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
+            rows.append([plant, titled(name), share, quantile_cell(one, 1e3), quantile_cell(one - found.plans, 1e3)])
             for rival in ("none", "model"):
                 wins = superiority(one, own[CONTROLLERS.index(rival)], floor=TIE)
                 rows[-1].append("" if rival == name else wins_cell(wins))
@@ -260,10 +260,10 @@ def critical_widths(found: Found, shown: str) -> Table:
         "less than model",
     ]
     says = (
-        f"At 95 % success the plans themselves need {_quantile(found.plans, 1e3)} mm; corridors left out because no "
-        f"plan goes through: {found.impassable}. In paired draws, with 95 % "
-        f"confidence and differences up to {1e3 * TIE:.0f} mm as ties: {_against('none', needed, TIE)}; "
-        f"{_against('model', needed, TIE)}."
+        f"At 95 % success the plans themselves need {quantile_cell(found.plans, 1e3)} mm; corridors left out because "
+        f"no plan goes through: {found.impassable}. In paired draws, with 95 % confidence and differences up to "
+        f"{1e3 * TIE:.0f} mm as ties: {against('none', needed, TIE)}; "
+        f"{against('model', needed, TIE)}."
     )
     return Table(f"Critical width of a corridor at {found.speeds[-1]:.2f} m/s ({shown})", says, frame(rows, header))
 
@@ -276,11 +276,11 @@ def critical_speeds(found: Found, shown: str) -> Table:
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):
             counts = " / ".join(f"{np.mean(one >= speed):.2f}" for speed in found.speeds)
-            rows.append([plant, titled(name), _quantile(-one, -1), counts])
+            rows.append([plant, titled(name), quantile_cell(-one, -1), counts])
     header = ["plant", "controller", "critical speed, m/s", "success up to each speed"]
     says = (
         f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
-        f"In paired draws, with 95 % confidence: {_against('none', -critical, 0)}; {_against('model', -critical, 0)}."
+        f"In paired draws, with 95 % confidence: {against('none', -critical, 0)}; {against('model', -critical, 0)}."
     )
     return Table(f"Critical speed with an allowance of {1e3 * ALLOWANCE:.0f} mm ({shown})", says, frame(rows, header))
 
@@ -292,7 +292,7 @@ def budget(found: Found, shown: str) -> Table:
         for c, name in enumerate(CONTROLLERS):
             every = found.map_off[c, p], found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
             parts = [needed - found.plans for needed in every]
-            rows.append([plant, titled(name), *(_quantile(part, 1e3) for part in parts)])
+            rows.append([plant, titled(name), *(quantile_cell(part, 1e3) for part in parts)])
             value = [quantile_interval(part, CRITICAL_SHARE).value for part in parts]
             if plant == "nominal" and np.isfinite(value).all():
                 off, right, *others = (1e3 * v for v in value)
@@ -316,7 +316,7 @@ def budget(found: Found, shown: str) -> Table:
     return Table(f"Error budget of the allowance ({shown})", says, frame(rows, header))
 
 
-def _quantile(samples: Array, scale: float) -> str:
+def quantile_cell(samples: Array, scale: float) -> str:
     """Returns the quantile at `CRITICAL_SHARE` times the scale, with its interval; negated samples: a negated scale."""
     value, low, high, *_ = quantile_interval(samples, CRITICAL_SHARE)
     low, high = sorted((scale * low, scale * high))
@@ -327,7 +327,7 @@ def _text(value: float) -> str:
     return "∞" if value == np.inf else "–" if not np.isfinite(value) else number(value, 4) if value else "0"
 
 
-def _against(rival: FeedforwardName, samples: Array, floor: float) -> str:
+def against(rival: FeedforwardName, samples: Array, floor: float) -> str:
     """Returns in words who beats or loses to a rival, and where.
 
     Args:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mrctl.experiments import learned_limits, mission_suite, three_mppis
+from mrctl.experiments import learned_limits, mission_suite, reactive_corridors, three_mppis
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import Mode
 from mrctl.experiments.tables import Table, machine, output_folder, write_json
@@ -32,6 +32,7 @@ class Part(NamedTuple):
 
 PARTS = [
     Part("table", mission_suite.drive, mission_suite.tables, mission_suite.values),
+    Part("reactive", reactive_corridors.drive, reactive_corridors.tables, reactive_corridors.values),
     Part("mppi", three_mppis.drive, three_mppis.tables, three_mppis.values),
     Part("limits", learned_limits.drive, learned_limits.tables, learned_limits.values),
 ]

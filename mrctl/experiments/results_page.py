@@ -81,6 +81,7 @@ def main(
     tune: tuple[Path, ...] = (),
     search: tuple[Path, ...] = (),
     navigate: tuple[Path, ...] = (),
+    reactive: tuple[Path, ...] = (),
     mppi: tuple[Path, ...] = (),
     limits: tuple[Path, ...] = (),
     identify: tuple[Path, ...] = (),
@@ -100,11 +101,12 @@ def main(
         search: Folders that `mrctl tune --search` wrote, one for each entry.
         navigate: Folders that `mrctl navigate --suite` wrote, one for each robot and tier, for what it found in
             corridors.
+        reactive: The same folders, for what it found in corridors in reactive mode.
         mppi: The same folders, for what it found with MPPI.
         limits: The same folders, for what it found with learned limits.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
-        everything: Instead, run all these commands in this folder, some five hours of two cores, and take what they
+        everything: Instead, run all these commands in this folder, some six hours of two cores, and take what they
             write. Those that this version of mrctl has ended there already are not run again, so that the same command
             goes on where it was stopped.
         out: The page to write.
@@ -118,7 +120,7 @@ def main(
         (held_out,), (bench,) = found["held_out"], found["bench"]
         tune, search, identify = found["tune"], found["search"], found["identify"]
         navigate = found["navigate"]
-        mppi = limits = navigate[: len(ROBOTS)]
+        reactive = mppi = limits = navigate[: len(ROBOTS)]
     made = {
         "The paper": reproduce and _paper_section(reproduce),
         "The uncertainty suite": suite and _suite_section(suite),
@@ -127,6 +129,7 @@ def main(
         **_tune_sections(tune),
         "The search of settings": search and _search_section(search),
         "How narrow and how fast": navigate and _navigated(navigate, "table", "needed"),
+        "How narrow in reactive mode": reactive and _navigated(reactive, "reactive", "widths"),
         "Three MPPIs": mppi and _navigated(mppi, "mppi", "runs"),
         "Feeding up": limits and _navigated(limits, "limits", "limits"),
         "Identification": identify and _identify_section(identify),

@@ -13,9 +13,11 @@ from test_commands import refused
 
 import mrctl.experiments.learned_limits as feeding
 import mrctl.experiments.mission_suite as suite
+import mrctl.experiments.reactive_corridors as reactive
 import mrctl.experiments.three_mppis as three
 import mrctl.navigation.mppi as mppi
 from mrctl import Lemniscate, Perturbation, Scenario, cli, simulate
+from mrctl.experiments.navigation_suite import PARTS
 from mrctl.navigation.generators import bent_line, corridor, corridor_width
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
@@ -66,10 +68,11 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     """The tables say what the numbers beside them say."""
     monkeypatch.setattr(suite, "DRAWS", {"quick": 3})
     monkeypatch.setattr(suite, "SPEEDS", (0.6, 0.9))
-    for part in (suite, three):
+    for part in (suite, reactive, three):
         monkeypatch.setattr(part, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
     monkeypatch.setattr(three, "WORLDS", {"quick": 1})
-    monkeypatch.setattr(feeding, "DRAWS", {"quick": 1})
+    for part in (reactive, feeding):
+        monkeypatch.setattr(part, "DRAWS", {"quick": 1})
     monkeypatch.setattr(feeding, "PLANTS", {"all": suite.PERTURBATIONS["all"]})
     monkeypatch.setattr(mppi, "SAMPLES", 200)
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
@@ -79,6 +82,13 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert needed.shape == (2, 4, 1, 3) and np.all(needed > np.ptp(HULL[:, 1]))
     assert np.abs(needed - values["plans"]).max() < 0.1
     assert f"{1e3 * needed[-1, 0, 0].max():.1f} [" in printed and "| 3/3 [44, 100] %" in printed
+    values = json.loads((tmp_path / "reactive.json").read_text())
+    assert "\n12 runs with the dynamic window, about 1 min" in printed
+    assert (tmp_path / "reactive.md").read_text() in printed
+    needed = np.array(values["widths"], float)
+    assert needed.shape == (4, 1, 1)
+    assert set(needed.ravel()) <= {values["robot_width"] + room for room in reactive.ROOMS}
+    assert f"| {1e3 * needed[0, 0, 0]:.1f} [" in printed
     values = json.loads((tmp_path / "mppi.json").read_text())
     assert "\n3 runs with MPPI, about 1 min" in printed and (tmp_path / "mppi.md").read_text() in printed
     assert list(values["runs"]) == list(three.ENTRIES) and 0.005 < values["lag"] < 0.1
@@ -96,16 +106,17 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert before["arrived"] and after["arrived"] and before["plan"] < after["plan"] < 1.1 * before["plan"]
     assert after["error"] < before["error"]
     # Stopped half-way, it goes on where it was; with everything driven, it drives nothing.
-    first = {name: (tmp_path / name).read_bytes() for name in ("table.json", "mppi.json", "limits.json")}
-    for name, lines in (("table.jsonl", 5), ("mppi.jsonl", 2), ("limits.jsonl", 1)):
+    first = {f"{part.files}.json": (tmp_path / f"{part.files}.json").read_bytes() for part in PARTS}
+    for name, lines in (("table.jsonl", 5), ("reactive.jsonl", 2), ("mppi.jsonl", 2), ("limits.jsonl", 1)):
         kept = (tmp_path / name).read_text().splitlines(keepends=True)
         (tmp_path / name).write_text("".join(kept[:lines]) + kept[lines][:30])
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("24 runs, about") and "\n2 runs with MPPI" in printed
+    assert "\n9 runs with the dynamic window" in printed
     assert "\n3 runs with nominal" in printed
     assert {name: (tmp_path / name).read_bytes() for name in first} == first
-    for part in (suite, three, feeding):
+    for part in (suite, reactive, three, feeding):
         monkeypatch.setattr(part, "simulate", None)
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     assert {name: (tmp_path / name).read_bytes() for name in first} == first
@@ -113,6 +124,30 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert "other results (scenario differs)" in refused(
         capsys, "navigate", "--suite", "--quick", "--robot.path", "turtlebot", "--out", str(tmp_path)
     )
+
+
+def test_width_by_bisection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The width of a draw is the least at which it passes, of all that are tried, or infinite."""
+    one, tried = reactive.Draw(0, Scenario(), 0.4), []
+    for least in (0.0, *reactive.ROOMS, 1.0):
+
+        def passes(_: object, width: float, __: object, least: float = least) -> bool:
+            tried[-1] += 1
+            return width > 0.4 + least - 1e-9
+
+        tried.append(0)
+        monkeypatch.setattr(reactive, "passes", passes)
+        (found,) = reactive._driven([one], "none", Perturbation(), 1)
+        assert found == min((0.4 + room for room in reactive.ROOMS if room >= least), default=np.inf)
+    assert set(tried) == {reactive.TRIES}
+
+
+def test_narrow_corridor_in_reactive_mode() -> None:
+    """A robot passes a corridor that is 30 cm wider than itself, and none that is narrower than itself."""
+    one = reactive.draw(Scenario(), 0)
+    assert one is not None and one.width == pytest.approx(np.ptp(HULL[:, 1]))
+    assert reactive.passes(one, one.width + 0.3, {"learner": "none"})
+    assert not reactive.passes(one, one.width + 0.005, {"learner": "none"})
 
 
 def test_ties_of_critical_speeds() -> None:

@@ -15,7 +15,14 @@ import victim
 from test_sweeps import FILE, children, content, failures, poisoned, refused, until
 
 from mrctl import InputError, Scenario, Sweep, cli
-from mrctl.experiments import journal, learned_limits, mission_suite, navigation_suite, three_mppis
+from mrctl.experiments import (
+    journal,
+    learned_limits,
+    mission_suite,
+    navigation_suite,
+    reactive_corridors,
+    three_mppis,
+)
 from mrctl.sweep import jobs
 from mrctl.sweep.store import Store
 
@@ -133,10 +140,11 @@ def test_poison(cluster, tmp_path):
 
 def test_suite_of_missions(cluster, tmp_path, monkeypatch):
     """`mrctl navigate --suite` computes the same on a cluster as here, but says where it was computed."""
-    for part in (mission_suite, learned_limits):
+    for part in (mission_suite, reactive_corridors, learned_limits):
         monkeypatch.setattr(part, "DRAWS", {"quick": 1})
     monkeypatch.setattr(mission_suite, "SPEEDS", (0.6,))
-    monkeypatch.setattr(mission_suite, "CONTROLLERS", ("none", "model"))
+    for part in (mission_suite, reactive_corridors):
+        monkeypatch.setattr(part, "CONTROLLERS", ("none", "model"))
     monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
     monkeypatch.setattr(three_mppis, "WORLDS", {"quick": 1})
     monkeypatch.setattr(three_mppis, "PLANTS", {"nominal": three_mppis.PLANTS["nominal"]})
@@ -144,7 +152,7 @@ def test_suite_of_missions(cluster, tmp_path, monkeypatch):
     assert list(navigation_suite.suite(Scenario(), "quick", folders[0], cluster[0])) == list(
         navigation_suite.suite(Scenario(), "quick", folders[1])
     )
-    for part in ("table", "mppi", "limits"):
+    for part in ("table", "reactive", "mppi", "limits"):
         kept = [sorted((folder / f"{part}.jsonl").read_text().splitlines()) for folder in folders]
         assert len(kept[0]) > 2 and kept[0] == kept[1]
         there, here = (json.loads((folder / f"{part}.json").read_text()) for folder in folders)

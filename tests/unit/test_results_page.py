@@ -96,7 +96,9 @@ def navigated(tmp_path: Path) -> Path:
     values = {"scenario": {"robot": {"path": "racecar"}, "sensing": {"tier": "field"}}, "mode": "quick", "needed": []}
     folder = written(tmp_path / "navigated", values, "## Critical width\n\nAll tie.\n\n| plant |\n| --- |\n")
     write_json(folder / "mppi.json", SOURCE | values | {"runs": {}})
+    write_json(folder / "reactive.json", SOURCE | values | {"widths": []})
     write_json(folder / "limits.json", SOURCE | values | {"limits": {}})
+    (folder / "reactive.md").write_text("## Critical width in reactive mode\n\nLevel.\n\n| plant |\n| --- |\n")
     (folder / "limits.md").write_text("## Up\n\nSmaller.\n\n| plant |\n| --- |\n")
     (folder / "mppi.md").write_text("## Three\n\nNone differs.\n\n| plant |\n| --- |\n")
     return folder
@@ -135,7 +137,7 @@ def test_sections(
     """Every input becomes a section with its numbers, and with the versions and the machine that it names."""
     out = tmp_path / "RESULTS.md"
     inputs = {"suite": suite, "reproduce": reproduction, "tune": tune, "search": searched}
-    inputs |= {"navigate": navigated, "mppi": navigated, "limits": navigated}
+    inputs |= {"navigate": navigated, "reactive": navigated, "mppi": navigated, "limits": navigated}
     inputs |= {"identify": identified, "bench": figures}
     words = [word for name, path in inputs.items() for word in (f"--{name}", str(path))]
     words.insert(words.index("--tune") + 1, str(designed))
@@ -143,7 +145,14 @@ def test_sections(
     page = results_page.sections(out.read_text())
     titles = ["The paper", "The uncertainty suite", "The designed PID", "Where learning is safe"]
     titles += ["The search of settings"]
-    titles += ["How narrow and how fast", "Three MPPIs", "Feeding up", "Identification", "Speed"]
+    titles += [
+        "How narrow and how fast",
+        "How narrow in reactive mode",
+        "Three MPPIs",
+        "Feeding up",
+        "Identification",
+        "Speed",
+    ]
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
     short, *folded = page["The uncertainty suite"].split("<details>")
@@ -245,7 +254,7 @@ def test_refused_before_anything_runs(
     assert capsys.readouterr().err == f"out: {tmp_path}/tune/imc holds table.json already; nothing was overwritten\n"
 
 
-@pytest.mark.parametrize("source", [*results_page.SOURCES, "mppi", "limits"])
+@pytest.mark.parametrize("source", [*results_page.SOURCES, "reactive", "mppi", "limits"])
 def test_sources(source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Each input of the page has its commands, whose flags are flags of mrctl."""
     assert source in inspect.signature(results_page.main).parameters
