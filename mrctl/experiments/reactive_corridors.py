@@ -48,7 +48,7 @@ from mrctl.theory.perturbation import Perturbation
 ROOMS = (0.06, 0.09, 0.12, 0.15, 0.18, 0.24, 0.3)  # m, by which a corridor is wider than the robot; chosen
 TRIES = 3  # runs in which the bisection finds one of them, or none
 DRAWS = {"quick": 4, "core": 80}  # with fewer than 72 the interval of a critical width has no upper end
-SIMULATED_PER_SECOND = 12  # simulated s in a s of one core
+SIMULATED_PER_SECOND = 5  # simulated s in a s of one core
 PLANNED_TIMES = 1.3  # time of a run over that of its plan, on average
 
 

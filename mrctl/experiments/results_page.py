@@ -106,7 +106,7 @@ def main(
         limits: The same folders, for what it found with learned limits.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
-        everything: Instead, run all these commands in this folder, some six hours of two cores, and take what they
+        everything: Instead, run all these commands in this folder, some seven hours of two cores, and take what they
             write. Those that this version of mrctl has ended there already are not run again, so that the same command
             goes on where it was stopped.
         out: The page to write.
