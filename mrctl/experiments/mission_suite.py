@@ -320,10 +320,11 @@ def quantile_cell(samples: Array, scale: float) -> str:
     """Returns the quantile at `CRITICAL_SHARE` times the scale, with its interval; negated samples: a negated scale."""
     value, low, high, *_ = quantile_interval(samples, CRITICAL_SHARE)
     low, high = sorted((scale * low, scale * high))
-    return f"{_text(scale * value)} [{_text(low)}, {_text(high)}]"
+    return f"{finite_text(scale * value)} [{finite_text(low)}, {finite_text(high)}]"
 
 
-def _text(value: float) -> str:
+def finite_text(value: float) -> str:
+    """Returns a number as text, or ∞, or a dash for none."""
     return "∞" if value == np.inf else "–" if not np.isfinite(value) else number(value, 4) if value else "0"
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import (
     CONTROLLERS,
+    CRITICAL_SHARE,
     PLAN_MARGINS,
     PLANTS,
     ROOMY_FACTOR,
@@ -29,7 +30,7 @@ from mrctl.experiments.mission_suite import (
     Mode,
     against,
     drawn,
-    quantile_cell,
+    finite_text,
 )
 from mrctl.experiments.suite_tables import titled
 from mrctl.experiments.tables import Table, frame, share_cell, wins_cell
@@ -41,7 +42,7 @@ from mrctl.navigation.mission import reached
 from mrctl.navigation.planning import PATIENCE, prepared
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
-from mrctl.results.comparison import superiority
+from mrctl.results.comparison import quantile_interval, superiority
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.perturbation import Perturbation
 
@@ -157,7 +158,9 @@ def tables(found: Found, shown: str) -> list[Table]:
         for name, one in zip(CONTROLLERS, own, strict=True):
             through = [int((one <= found.width + room + 1e-9).sum()) for room in ROOMS]
             shares = " / ".join(f"{count / len(one):.2f}" for count in through)
-            rows.append([plant, titled(name), share_cell(through[-1], len(one)), quantile_cell(one, 1e3), shares])
+            rows.append(
+                [plant, titled(name), share_cell(through[-1], len(one)), critical_cell(found.width, one), shares]
+            )
             for rival in ("none", "model"):
                 wins = superiority(one, own[CONTROLLERS.index(rival)])
                 rows[-1].append("" if rival == name else wins_cell(wins))
@@ -166,7 +169,22 @@ def tables(found: Found, shown: str) -> list[Table]:
     widths = ", ".join(f"{1e3 * (found.width + room):.0f}" for room in ROOMS)
     says = (
         f"With the dynamic window, which sees the walls on its map, a robot of {1e3 * found.width:.0f} mm drives "
-        f"corridors of {widths} mm. In paired draws, with 95 % confidence: {against('none', found.needed, 0)}; "
+        f"corridors of {widths} mm. The interval of a critical width reaches down to the width tried before. In paired "
+        f"draws, with 95 % confidence: {against('none', found.needed, 0)}; "
         f"{against('model', found.needed, 0)}."
     )
     return [Table(f"Critical width of a corridor in reactive mode ({shown})", says, frame(rows, header))]
+
+
+def critical_cell(width: float, needed: Array) -> str:
+    """Returns the critical width in mm with its 95 % interval, which allows for the widths that were not tried.
+
+    Args:
+        width: Width of the robot in m.
+        needed: Widths that the draws need, as in `Found`, `(draws,)`.
+    """
+    tried = width + np.array([0.0, *ROOMS])
+    too_narrow = tried[np.searchsorted(tried, needed - 1e-9) - 1]
+    value, _, high, *_ = quantile_interval(needed, CRITICAL_SHARE)
+    low = quantile_interval(too_narrow, CRITICAL_SHARE).low
+    return f"{finite_text(1e3 * value)} [{finite_text(1e3 * low)}, {finite_text(1e3 * high)}]"

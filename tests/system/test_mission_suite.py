@@ -142,6 +142,13 @@ def test_width_by_bisection(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(tried) == {reactive.TRIES}
 
 
+def test_critical_cell() -> None:
+    """Of 80 draws of which 60 need 0.57 m and 20 need 0.6, 95 % pass at 0.6 m, and at some width above 0.57."""
+    needed = 0.42 + np.repeat(reactive.ROOMS[3:5], (60, 20))
+    assert reactive.critical_cell(0.42, needed) == "600.0 [570.0, 600.0]"
+    assert reactive.critical_cell(0.42, np.full(80, np.inf)) == "∞ [720.0, ∞]"
+
+
 def test_narrow_corridor_in_reactive_mode() -> None:
     """A robot passes a corridor that is 30 cm wider than itself, and none that is narrower than itself."""
     one = reactive.draw(Scenario(), 0)
