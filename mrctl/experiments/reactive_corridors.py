@@ -4,8 +4,9 @@ A robot that follows its plan in time does not see walls, so that one run shows 
 (`mission_suite`). The dynamic window sees the walls on the map, and what it does depends on them. Here each draw is
 therefore driven in corridors of several widths around the same plan, which keeps as far from the walls of a roomy
 corridor as it can. A draw is a corridor, and a robot on one day (`mrctl.scenario.replicates`); all controllers have the
-same draws. The width that a draw needs is the least of those in `ROOMS`, found by bisection: it takes for granted that
-who does not pass does not pass what is narrower.
+same draws. A robot passes if it arrives within `PATIENCE` times the time of its plan. The width that a draw needs is
+the least of those in `ROOMS` that it passes, found by bisection: it takes for granted that who does not pass does not
+pass what is narrower.
 """
 
 from __future__ import annotations
