@@ -1,4 +1,4 @@
-"""A file that keeps results as they come, so that a command goes on where it stopped; a cluster may compute them."""
+"""A file that keeps results as they come, so that a command goes on where it stopped; other processes compute them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mrctl.loop.groups import cores
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
 from mrctl.sweep.jobs import code_digest
-from mrctl.sweep.pool import Cluster, JobOutcome, carry_out, check_address
+from mrctl.sweep.pool import Cluster, JobOutcome, Processes, carry_out, check_address
 
 SHOWING_ROOMS = ("envs", "viewer", "cli", "__main__.py")  # rooms on which no experiment depends
 
@@ -25,9 +25,8 @@ class Computation(NamedTuple):
 
     key: object
     """Key of its result, of numbers, strings and lists."""
-    compute: Callable[[int], object]
-    """Returns the result, of numbers, strings, lists and dictionaries; its argument is the number of threads to use.
-    Workers of a cluster get it pickled."""
+    compute: Callable[[], object]
+    """Returns the result, of numbers, strings, lists and dictionaries, in one thread. Workers get it pickled."""
 
 
 class Journal:
@@ -52,9 +51,10 @@ class Journal:
             file: The file; an unfinished last line is dropped.
             head: Everything that the results depend on, but what `origin` returns and the Python code of mrctl, whose
                 digest is added.
-            scheduler: Address of a Dask scheduler whose workers compute results; by default this process does.
-            origin: Returns what must be the same in this process and in the workers of a cluster, which get it pickled,
-                such as digests of files.
+            scheduler: Address of a Dask scheduler whose workers compute results; by default processes on this machine
+                do, one a core.
+            origin: Returns what must be the same in this process and in the workers, which get it pickled, such as
+                digests of files.
 
         Raises:
             InputError: The results in the file depend on something else, it cannot be read or written, or no scheduler
@@ -101,44 +101,43 @@ class Journal:
         self._known[json.dumps(key)] = json.loads(line)["value"]
 
     def expected(self, seconds: float, parts: int) -> str:
-        """Says how long computations take: seconds of one core in so many equal parts that can be done at a time."""
-        at_once = self.cores if self._scheduler is None else max(1, min(self.cores, parts))
+        """Says how long computations take: seconds of one core in so many equal parts."""
+        at_once = max(1, min(self.cores, parts))
         return f"about {max(1, round(seconds / at_once / 60))} min on {at_once} core{'s' * (at_once > 1)}"
 
     def results(self, parts: Sequence[Computation]) -> list[Any]:
         """Returns the results of computations; those that are missing are computed and kept, with a progress bar.
 
         Raises:
-            InputError: The workers of the cluster have other code, the scheduler is gone, or a computation fails there.
+            InputError: A computation fails, the workers of the cluster have other code, or the scheduler is gone.
         """
         missing = [k for k, part in enumerate(parts) if part.key not in self]
         with tqdm(total=len(parts), initial=len(parts) - len(missing), unit="part") as bar:
-            if self._scheduler is not None and missing:
-                self._on_cluster(parts, missing, self._scheduler, bar)
-                missing = []
-            for k in missing:
-                self[parts[k].key] = parts[k].compute(self.cores)
-                bar.update()
+            if missing:
+                self._compute(parts, missing, bar)
         return [self[part.key] for part in parts]
 
-    def _on_cluster(self, parts: Sequence[Computation], missing: Sequence[int], scheduler: str, bar: tqdm) -> None:
-        """Has a cluster do computations, and keeps their results."""
+    def _compute(self, parts: Sequence[Computation], missing: Sequence[int], bar: tqdm) -> None:
+        """Has workers do computations, and keeps their results."""
 
         def ended(outcome: JobOutcome) -> None:
             if not outcome.error:
                 self[parts[outcome.job].key] = outcome.value
                 bar.update()
 
-        computed = {k: pickle.dumps(parts[k].compute) for k in missing}
         here = versions() | self._origin() | {"code": code_digest(SHOWING_ROOMS)}
-        pool = Cluster(Remote(computed, self._origin, here), "", scheduler)
+        work = Computing({k: pickle.dumps(parts[k].compute) for k in missing}, self._origin, here)
+        if self._scheduler is None:
+            pool = Processes(work, "", min(self.cores, len(missing)))
+        else:
+            pool = Cluster(work, "", self._scheduler)
         try:
             aside = carry_out(pool, missing, ended)
         finally:
             pool.close()
         if aside:
             k, why = min(aside.items())
-            raise InputError(f"scheduler: {json.dumps(parts[k].key)} failed there: {why}; what was done is kept")
+            raise InputError(f"{json.dumps(parts[k].key)} failed: {why}; what was done is kept")
 
 
 def threads_of(scheduler: str) -> int:
@@ -148,15 +147,15 @@ def threads_of(scheduler: str) -> int:
         InputError: No scheduler or no worker answers.
     """
     check_address(scheduler)
-    pool = Cluster(Remote({}, dict, {}), "", scheduler)
+    pool = Cluster(Computing({}, dict, {}), "", scheduler)
     try:
         return pool.room()
     finally:
         pool.close()
 
 
-class Remote(NamedTuple):
-    """What a worker of a cluster does; it has to have the versions, the code and the files of the process that asks."""
+class Computing(NamedTuple):
+    """What a worker does; it has to have the versions, the code and the files of the process that asks."""
 
     computed: dict[int, bytes]
     """Pickled `Computation.compute`, by number of the job; unpickled after the check below alone."""
@@ -166,9 +165,14 @@ class Remote(NamedTuple):
     """Versions of the packages of the process that asks, what `origin` returned there, and the digest of its code."""
 
     def __call__(self, _: str, job: int) -> JobOutcome:
-        """Does a computation with one thread."""
+        """Does a computation."""
         here = versions() | self.origin() | {"code": code_digest(SHOWING_ROOMS)}
         if other := next((name for name, value in self.there.items() if here.get(name) != value), ""):
             who = f"worker {os.getpid()} on {os.uname().nodename}"
             return JobOutcome(job, error=f"scheduler: {who} has another {other} than this process", fatal=True)
-        return JobOutcome(job, value=pickle.loads(self.computed[job])(1))  # noqa: S301 (from the process that asks)
+        try:
+            return JobOutcome(job, value=pickle.loads(self.computed[job])())  # noqa: S301 (from the process that asks)
+        except InputError as error:
+            return JobOutcome(job, error=str(error), fatal=True)
+        except Exception as error:  # noqa: BLE001 (whatever the error is, the other computations go on)
+            return JobOutcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))

@@ -111,7 +111,7 @@ def draw(vehicle: Vehicle, width: float, speed: float, seed: int) -> Draw | None
         return Draw(seed, *planned(Query(task, vehicle, speed, REPLAN_MARGIN)), task.goal)
 
 
-def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float, threads: int) -> dict[str, list[Run]]:
+def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float) -> dict[str, list[Run]]:
     """Drives all draws, then plans with what was learned and drives both plans of each; returns the runs by limits.
 
     Args:
@@ -119,9 +119,8 @@ def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float,
         draws: The draws.
         robot: The nominal robot.
         speed: Largest speed of the plans in m/s.
-        threads: Number of threads.
     """
-    first = simulate([_replicate(perturbed, one, one.reference) for one in draws], threads=threads)
+    first = simulate([_replicate(perturbed, one, one.reference) for one in draws], threads=1)
     with TemporaryDirectory() as folder:
         files, references = [], []
         for k, one in enumerate(draws):
@@ -133,7 +132,7 @@ def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float,
             files.append(path if learns else None)
             references.append(one.plan.reference(speed, limits))
         ways = {"nominal": [one.reference for one in draws], "learned": references}
-        return {name: _driven(perturbed, draws, way, files, threads) for name, way in ways.items()}
+        return {name: _driven(perturbed, draws, way, files) for name, way in ways.items()}
 
 
 def limits_of(run: xr.Dataset, robot: Robot) -> Limits:
@@ -161,15 +160,11 @@ def _replicate(scenario: Scenario, one: Draw, reference: Waypoints, learned: str
 
 
 def _driven(
-    perturbed: Scenario,
-    draws: Sequence[Draw],
-    references: Sequence[Waypoints],
-    files: Sequence[str | None],
-    threads: int,
+    perturbed: Scenario, draws: Sequence[Draw], references: Sequence[Waypoints], files: Sequence[str | None]
 ) -> list[Run]:
     """Drives plans with what was learned."""
     cases = zip(draws, references, files, strict=True)
-    result, found = simulate([_replicate(perturbed, *case) for case in cases], threads=threads), []
+    result, found = simulate([_replicate(perturbed, *case) for case in cases], threads=1), []
     for k, (one, reference) in enumerate(zip(draws, references, strict=True)):
         run = result.isel(run=k).dropna("time", subset=["x"])
         there = reached(run, one.goal)

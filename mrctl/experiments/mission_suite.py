@@ -132,7 +132,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     print(f"{count * len(PLANTS) * len(left):,} runs, {journal.expected(seconds, len(left))}", flush=True)
     size = len(CONTROLLERS), len(PLANTS), count
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
-    drives = [Computation(series.key, partial(_driven, series, base, draws, vehicle.footprint)) for series in every]
+    plants, corners = list(PLANTS.values()), vehicle.footprint
+    drives = [Computation(series.key, partial(_driven, series, base, plants, draws, corners)) for series in every]
     for series, driven in zip(every, journal.results(drives), strict=True):
         c, widths = CONTROLLERS.index(series.controller), np.array(driven, float)
         if series.posture_known:
@@ -187,22 +188,24 @@ def draw(vehicle: Vehicle, seed: int, width: float, speeds: Sequence[float]) -> 
     return None
 
 
-def _driven(series: Series, base: Scenario, draws: Sequence[Draw], corners: Array, threads: int) -> list[Any]:
+def _driven(
+    series: Series, base: Scenario, plants: Sequence[Perturbation], draws: Sequence[Draw], corners: Array
+) -> list[Any]:
     """Drives a series; returns the widths that the runs need in m, as `_widths` does."""
-    return _widths(_simulated(series, base, draws, threads), draws, corners).tolist()
+    return _widths(_simulated(series, base, plants, draws), draws, corners).tolist()
 
 
-def _simulated(series: Series, base: Scenario, draws: Sequence[Draw], threads: int) -> xr.Dataset:
+def _simulated(series: Series, base: Scenario, plants: Sequence[Perturbation], draws: Sequence[Draw]) -> xr.Dataset:
     """Drives all draws on all plants; run p · D + d is draw d of D on plant p."""
     own = base.replace(**FEEDFORWARDS[series.controller], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     if series.posture_known:
         own = own.replace(sensing=own.sensing.replace(estimator="truth"))
     scenarios = [
         own.replace(perturbation=plant, reference=one.references[series.speed], goal=one.goal)
-        for plant in PLANTS.values()
+        for plant in plants
         for one in draws
     ]
-    return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)], threads=threads)
+    return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)], threads=1)
 
 
 def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
@@ -225,7 +228,7 @@ def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
                 corridor_width(corners, poses, one.seed, **SHAPE, aside=off)
                 for poses, off in ((own, 0.0), (on_reference, 0.0), (own, aside))
             ]
-    return found.reshape(3, len(PLANTS), -1)
+    return found.reshape(3, -1, len(draws))
 
 
 def tables(found: Found, shown: str) -> list[Table]:

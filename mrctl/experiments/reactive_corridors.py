@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -117,7 +116,7 @@ def draw(base: Scenario, seed: int) -> Draw | None:
     return None
 
 
-def _driven(draws: Sequence[Draw], controller: FeedforwardName, plant: Perturbation, threads: int) -> list[float]:
+def _driven(draws: Sequence[Draw], controller: FeedforwardName, plant: Perturbation) -> list[float]:
     """Drives all draws with one controller on one plant; returns the widths that they need in m, as in `Found`."""
     changes = {**FEEDFORWARDS[controller], "perturbation": plant}
 
@@ -125,8 +124,7 @@ def _driven(draws: Sequence[Draw], controller: FeedforwardName, plant: Perturbat
         first = bisect_left(ROOMS, True, key=lambda room: passes(one, one.width + room, changes))
         return one.width + ROOMS[first] if first < len(ROOMS) else np.inf
 
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(needed, draws))
+    return list(map(needed, draws))
 
 
 def passes(one: Draw, width: float, changes: dict[str, Any]) -> bool:

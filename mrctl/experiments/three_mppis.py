@@ -10,7 +10,6 @@ all three have the same worlds and draws.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -119,14 +118,13 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     return Found(lag, runs)
 
 
-def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, threads: int) -> dict[str, Any]:
+def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float) -> dict[str, Any]:
     """Drives all worlds.
 
     Args:
         worlds: The worlds.
         changes: What replaces the velocity controller and the robot of their scenarios.
         lag: Lag of the roll-outs in s.
-        threads: Number of threads.
 
     Returns:
         `runs`, and the `lag` in s that fits them, `fitted`.
@@ -136,8 +134,7 @@ def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, thread
         (scenario,) = replicates(one.scenario.replace(**changes), 1, one.seed)
         return simulate([scenario], threads=1, motion=avoiding("mppi", lag=lag))
 
-    with ThreadPoolExecutor(threads) as pool:
-        results = list(pool.map(driven, worlds))
+    results = list(map(driven, worlds))
     return {"runs": [ended(*case) for case in zip(results, worlds, strict=True)], "lag": fitted(results)}
 
 

@@ -11,6 +11,7 @@ import xarray as xr
 from scipy.signal import lsim
 from test_commands import refused
 
+import mrctl.experiments.journal as journal
 import mrctl.experiments.learned_limits as feeding
 import mrctl.experiments.mission_suite as suite
 import mrctl.experiments.reactive_corridors as reactive
@@ -22,11 +23,37 @@ from mrctl.navigation.generators import bent_line, corridor, corridor_width
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
+from mrctl.sweep.pool import JobOutcome, Work
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.timing import Limits
 
 HULL = footprint(mjcf.load())
+
+
+class Here:
+    """A pool that computes in this process, where what a test has changed is changed."""
+
+    tries = 1
+
+    def __init__(self, work: Work, path: str, _: int) -> None:
+        """Takes the arguments of `Processes`."""
+        self._work, self._path = work, path
+
+    def room(self) -> int:
+        """Returns the number of jobs that are computed at a time."""
+        return 1
+
+    def submit(self, job: int) -> None:
+        """Computes a job."""
+        self._outcome = self._work(self._path, job)
+
+    def wait(self) -> list[JobOutcome]:
+        """Returns how it ended."""
+        return [self._outcome]
+
+    def close(self) -> None:
+        """Has nothing to stop."""
 
 
 def test_corridor_width() -> None:
@@ -70,23 +97,26 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.setattr(suite, "SPEEDS", (0.6, 0.9))
     for part in (suite, reactive, three):
         monkeypatch.setattr(part, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
+    for part in (suite, reactive):
+        monkeypatch.setattr(part, "CONTROLLERS", ("none", "model"))
     monkeypatch.setattr(three, "WORLDS", {"quick": 1})
     for part in (reactive, feeding):
         monkeypatch.setattr(part, "DRAWS", {"quick": 1})
     monkeypatch.setattr(feeding, "PLANTS", {"all": suite.PERTURBATIONS["all"]})
     monkeypatch.setattr(mppi, "SAMPLES", 200)
+    monkeypatch.setattr(journal, "Processes", Here)
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     printed, values = capsys.readouterr().out, json.loads((tmp_path / "table.json").read_text())
-    assert printed.startswith("36 runs, about 1 min") and (tmp_path / "table.md").read_text() in printed
+    assert printed.startswith("18 runs, about 1 min") and (tmp_path / "table.md").read_text() in printed
     needed = np.array(values["needed"], float)
-    assert needed.shape == (2, 4, 1, 3) and np.all(needed > np.ptp(HULL[:, 1]))
+    assert needed.shape == (2, 2, 1, 3) and np.all(needed > np.ptp(HULL[:, 1]))
     assert np.abs(needed - values["plans"]).max() < 0.1
     assert f"{1e3 * needed[-1, 0, 0].max():.1f} [" in printed and "| 3/3 [44, 100] %" in printed
     values = json.loads((tmp_path / "reactive.json").read_text())
-    assert "\n12 runs with the dynamic window, about 1 min" in printed
+    assert "\n6 runs with the dynamic window, about 1 min" in printed
     assert (tmp_path / "reactive.md").read_text() in printed
     needed = np.array(values["widths"], float)
-    assert needed.shape == (4, 1, 1)
+    assert needed.shape == (2, 1, 1)
     assert set(needed.ravel()) <= {values["robot_width"] + room for room in reactive.ROOMS}
     assert f"| {1e3 * needed[0, 0, 0]:.1f} [" in printed
     values = json.loads((tmp_path / "mppi.json").read_text())
@@ -107,14 +137,13 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert after["error"] < before["error"]
     # Stopped half-way, it goes on where it was; with everything driven, it drives nothing.
     first = {f"{part.files}.json": (tmp_path / f"{part.files}.json").read_bytes() for part in PARTS}
-    for name, lines in (("table.jsonl", 5), ("reactive.jsonl", 2), ("mppi.jsonl", 2), ("limits.jsonl", 1)):
+    for name, lines in (("table.jsonl", 3), ("reactive.jsonl", 2), ("mppi.jsonl", 2), ("limits.jsonl", 1)):
         kept = (tmp_path / name).read_text().splitlines(keepends=True)
         (tmp_path / name).write_text("".join(kept[:lines]) + kept[lines][:30])
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("24 runs, about") and "\n2 runs with MPPI" in printed
-    assert "\n9 runs with the dynamic window" in printed
-    assert "\n3 runs with nominal" in printed
+    assert printed.startswith("12 runs, about") and "\n2 runs with MPPI" in printed
+    assert "\n3 runs with the dynamic window" in printed and "\n3 runs with nominal" in printed
     assert {name: (tmp_path / name).read_bytes() for name in first} == first
     for part in (suite, reactive, three, feeding):
         monkeypatch.setattr(part, "simulate", None)
@@ -137,7 +166,7 @@ def test_width_by_bisection(monkeypatch: pytest.MonkeyPatch) -> None:
 
         tried.append(0)
         monkeypatch.setattr(reactive, "passes", passes)
-        (found,) = reactive._driven([one], "none", Perturbation(), 1)
+        (found,) = reactive._driven([one], "none", Perturbation())
         assert found == min((0.4 + room for room in reactive.ROOMS if room >= least), default=np.inf)
     assert set(tried) == {reactive.TRIES}
 
@@ -234,7 +263,7 @@ def test_failure_in_the_first_tick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feeding, "simulate", partial(simulate, motion=Bad))
     draw = feeding.draw(Vehicle.of(Scenario()), 1.5 * float(np.ptp(HULL[:, 1])), 1.35, 1)
     assert draw is not None
-    (run,) = feeding._driven(Scenario(learner="none"), [draw], [draw.reference], [None], 1)
+    (run,) = feeding._driven(Scenario(learner="none"), [draw], [draw.reference], [None])
     assert not run.arrived and run.error == np.inf
 
 

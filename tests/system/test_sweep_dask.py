@@ -145,6 +145,7 @@ def test_suite_of_missions(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(mission_suite, "SPEEDS", (0.6,))
     for part in (mission_suite, reactive_corridors):
         monkeypatch.setattr(part, "CONTROLLERS", ("none", "model"))
+        monkeypatch.setattr(part, "PLANTS", {"nominal": part.PLANTS["nominal"]})
     monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
     monkeypatch.setattr(three_mppis, "WORLDS", {"quick": 1})
     monkeypatch.setattr(three_mppis, "PLANTS", {"nominal": three_mppis.PLANTS["nominal"]})

@@ -1,6 +1,8 @@
 """Results that are kept as they come."""
 
 import json
+import os
+from functools import partial
 
 import pytest
 from hypothesis import given, settings
@@ -32,8 +34,29 @@ def test_kept(results, cut, tmp_path_factory):
     file.write_bytes(file.read_bytes()[:-cut])
     torn = Journal(file, {"seed": 1})
     assert "last" not in torn and file.read_bytes() == whole
-    assert torn.results([Computation("last", lambda threads: [threads])]) == [[torn.cores]]
-    assert Journal(file, {"seed": 1})["last"] == [torn.cores]
+    torn["last"] = 7
+    assert Journal(file, {"seed": 1})["last"] == 7
+
+
+def test_computes(tmp_path):
+    """Other processes compute what is missing; what fails is named, and the rest is kept."""
+    journal = Journal(tmp_path / "results.jsonl", {"seed": 1})
+    journal["a"] = 1.5
+    parts = [
+        Computation(key, partial(int, text)) for key, text in zip(("a", *"bcd"), ("0", "11", "x", "13"), strict=True)
+    ]
+    with pytest.raises(mrctl.InputError, match=r'^"c" failed: ValueError: .*\'x\'; what was done is kept$'):
+        journal.results(parts)
+    again = Journal(tmp_path / "results.jsonl", {"seed": 1})
+    assert again["b"] == 11 and "c" not in again and again["d"] == 13
+    assert again.results([*parts[:2], Computation("c", os.getpid)])[:2] == [1.5, 11] and again["c"] != os.getpid()
+    with pytest.raises(mrctl.InputError, match="^stiffness: 3; what was done is kept$"):
+        again.results([Computation("e", partial(refuse, "stiffness: 3"))])
+
+
+def refuse(why):
+    """Refuses an input."""
+    raise mrctl.InputError(why)
 
 
 def test_killed_while_it_opens(tmp_path, monkeypatch):
