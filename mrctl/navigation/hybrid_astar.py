@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
-from mrctl.navigation.plan import Plan
+from mrctl.navigation.plan import SWITCH_COST, Plan
 from mrctl.navigation.steer import CHECK_SPACING, MAX_PIECES, Curve, advance, sample, shortest, steer
 from mrctl.record import InputError
 from mrctl.theory.clearance import clearance, cover, gap, point_to_polygon
@@ -28,7 +28,6 @@ from mrctl.theory.obstacles import Outlines
 
 HEADINGS = 72
 REVERSE_COST = 1.5  # cost of a metre in reverse
-SWITCH_COST = 0.5  # cost of a change of direction, m
 SHORTCUT_STRIDE = 5  # of these poses, between those to which shortcuts are looked for
 FOOTPRINT_DISCS = 4  # that cover the footprint; where one of them touches, the footprint itself is looked at
 SHORTEST_PATH = 2.0  # in place of the turn of an arc, a shortest path to the goal
@@ -181,10 +180,11 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
     found, made, expanded, left = search.compiled(start, goal, float(radius), step, reverse, ahead, where, best, tree)
     if found < 0:
         place = f"({goal[0]:.2f}, {goal[1]:.2f})"
-        few = f"no way to {place} was found with {most:,} poses"
+        kept = f" with a margin of {where.margin:g} m"
+        few = f"no way to {place}{kept} was found with {most:,} poses"
         # Where the way around the obstacles does not lead to the start, the search has not begun.
         at_border = bool(left) or not np.isfinite(ahead[cell_of.compiled(start, where)[:2]])
-        raise NoWay(f"goal: {f'there is no way to {place}' if found == -1 else few}", at_border)
+        raise NoWay(f"goal: {f'there is no way to {place}{kept}' if found == -1 else few}", at_border)
     return _traced(tree, int(made), int(found), radius, reverse, int(expanded))
 
 
@@ -334,7 +334,8 @@ def is_free(pose: Array, where: Space, sides: Array) -> bool:
         ahead, aside, radius = where.discs[k]
         x, y = pose[0] + c * ahead - s * aside, pose[1] + s * ahead + c * aside
         distance = value(field.distance, field.origin[0], field.origin[1], field.resolution, x, y)
-        # On the map a field that is interpolated may be too large by half a cell and too small by 1/√2 cells at most.
+        # On the map a field that is interpolated is off by at most 1/√2 cells. It is too large by more than half a cell
+        # amid four centres alone, where the margin may be a fifth of a cell less.
         known = on_map(x, y, field)
         clear &= known and distance - field.resolution / 2 > radius + where.margin
         if known and distance + field.resolution / np.sqrt(2) < where.depths[k] + where.margin:

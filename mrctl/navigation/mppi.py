@@ -24,6 +24,7 @@ SHOWN_SAMPLES = 40  # of the samples, which are kept to be looked at
 SAMPLE_DEVIATIONS = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
 LAG = 0.06  # s, of the roll-outs by default, two to three times that of the robots; chosen
 MAX_LAG = 10.0  # s
+KNOT_STEPS = np.linspace(0, STEPS - 1, KNOTS).round().astype(int)  # the steps nearest to the knots
 MAX_LEFT = 0.5  # share of the way to its target that may be left at the end of a roll-out that gets on; chosen
 
 
@@ -69,9 +70,12 @@ class Mppi(Reactive):
         """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""
         nominal, twists, costs, bounds = self._nominal[row], self._twists, self._costs, self.bounds[row]
         knots = self._noise * (np.array(SAMPLE_DEVIATIONS) * (bounds.speed, bounds.rotation))
-        knots[0] = 0.0  # one roll-out is nominal, and another brakes
-        knots[1] = -bounds.speed, 0.0
         nominal[:-1] = nominal[1:].copy()  # a period has passed
+        # One roll-out is nominal, one brakes, and one drives as the plan does. Without the last a robot stands where
+        # its plan is a loop that ends near it: all that it could do otherwise leads away at first.
+        knots[0] = 0.0
+        knots[1] = -bounds.speed, 0.0
+        knots[2] = (twists_along(scene.targets, period) - nominal)[KNOT_STEPS]
         state = pose, twist, last, self._lag, period, bounds, scene
         temperature = TEMPERATURE * min(1.0, bounds.speed / ORDINARY_SPEED) ** 2
         worth = MAX_COST_DIFFERENCE * temperature
@@ -84,3 +88,16 @@ class Mppi(Reactive):
         nominal[:] = mean if touches or costs[0] < TOUCH_COST else cheapest
         self.considered[row] = Considered(pose.copy(), some, nominal.copy(), last.copy())
         return nominal[0]
+
+
+def twists_along(targets: Array, period: float) -> Array:
+    """Returns the twists from target to target, V in m/s and θ̇ in rad/s, `(n, 2)`; the first is that to the second.
+
+    Args:
+        targets: As those of `Scene`.
+        period: Time from one to the next in s.
+    """
+    (cos, sin), (before, after) = targets[:, 2:].T, (targets[:-1], targets[1:])
+    turned = np.arctan2(cos[:-1] * sin[1:] - sin[:-1] * cos[1:], cos[:-1] * cos[1:] + sin[:-1] * sin[1:])
+    twists = np.column_stack([np.hypot(*(after - before)[:, :2].T), turned]) / period
+    return np.concatenate([twists[:1], twists])

@@ -15,6 +15,7 @@ from mrctl.theory.obstacles import Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import Limits
 
+SWITCH_COST = 0.5  # m, cost of a change of direction
 POINT_SPACING = 0.25  # m, about the distance of the points that the spline of a reference goes through
 MIN_CHORD = 1e-3  # m; the curvature at an end is computed as if its chord were at least that long
 NEARLY_STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
@@ -43,8 +44,10 @@ class Plan(NamedTuple):
         """Returns the plan with an arc before it, poses in m, m, rad, `(k, 3)`, that is driven forward to its start."""
         poses, forward = np.concatenate([arc[:-1], self.poses]), np.ones(len(arc) - 1)
         directions = np.concatenate([[0.0], forward, self.directions[1:]])
-        length = float(np.hypot(*np.diff(arc[:, :2], axis=0).T).sum())
-        return self._replace(poses=poses, directions=directions, cost=self.cost + length)
+        cost = self.cost + float(np.hypot(*np.diff(arc[:, :2], axis=0).T).sum())
+        if len(arc) > 1 and self.directions[1] < 0:
+            cost += SWITCH_COST
+        return self._replace(poses=poses, directions=directions, cost=cost)
 
     def reference(self, speed: float, limits: Limits, velocity: float = 0.0, curvature: float = 0.0) -> Waypoints:
         """Returns the plan as a reference: splines of continuous curvature, with the time law under all limits.

@@ -14,6 +14,7 @@ from mrctl.loop.goals import ARRIVAL_SPEED, arrived
 from mrctl.navigation.generators import Task
 from mrctl.navigation.hybrid_astar import NoWay, plan, shortcut, space, wider
 from mrctl.navigation.plan import Plan, least_clearance, run_out
+from mrctl.navigation.rollouts import STEPS
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
@@ -36,6 +37,7 @@ PATIENCE, WAITING_PATIENCE = 2, 4
 PLAN_MARGIN = 0.05  # m, margin of a plan
 REPLAN_MARGIN = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
+MAX_BARRIER_PERIOD = 0.2  # s, motion period beyond which the reaction of `barrier` is later than `REACTION_TIME`
 # s from a scan until a robot brakes, for all avoiders: with `window` and `mppi` the wait for the next motion period,
 # the change of the request over that period, and the lag of the robot
 REACTION_TIME = 3 * REACTIVE_PERIOD
@@ -111,15 +113,19 @@ def prepared(
         twist: V in m/s and θ̇ in rad/s with which the robot drives at its start.
 
     Raises:
-        InputError: As `planned`; or there is no such `avoid`, or it never plans in reverse and forward there is no way.
+        InputError: As `planned`; or there is no such `avoid`, it reacts too late with that motion period or those
+            brakes, or it never plans in reverse and forward there is no way.
     """
     check_avoid(avoid)
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
     query = Query(task, vehicle, speed, margin, twist=twist, keeps=not reactive)
     query.check()
+    if avoid == "barrier" and scenario.motion_period > MAX_BARRIER_PERIOD:
+        raise InputError(f"motion_period: barrier needs at most {MAX_BARRIER_PERIOD} s, not {scenario.motion_period:g}")
     if avoid != "none":
         fastest = LIMIT_SHARE * vehicle.robot.max_speed if speed is None else speed
-        query = query._replace(speed=min(fastest, speed_in_sight(vehicle, scenario.sensing.lidar)))
+        fastest = min(fastest, speed_in_sight(vehicle, scenario.sensing.lidar))
+        query = query._replace(speed=min(fastest, speed_in_horizon(vehicle)) if reactive else fastest)
     try:
         found, reference = planned(query, reverse=vehicle.reverses and not reactive, beyond=True)
     except NoWay:
@@ -156,6 +162,20 @@ def speed_in_sight(vehicle: Vehicle, lidar: Lidar) -> float:
         sees = f"with a range of {lidar.range:g} m and a rate of {lidar.rate:g} Hz"
         raise InputError(f"sensing.lidar: {sees} the robot cannot stop within what it sees")
     return float(speed)
+
+
+def speed_in_horizon(vehicle: Vehicle) -> float:
+    """Returns the V in m/s from which a robot can stop within a roll-out, else `window` and `mppi` would see too late.
+
+    It drives on for `REACTION_TIME`, and brakes with 0.9 of its largest acceleration.
+
+    Raises:
+        InputError: That speed is less than a plan can have.
+    """
+    speed = LIMIT_SHARE * vehicle.robot.max_acceleration * (STEPS * REACTIVE_PERIOD - REACTION_TIME)
+    if speed < MIN_SPEED:
+        raise InputError(f"avoid: the brakes of the robot are too weak to stop within {STEPS * REACTIVE_PERIOD:.1f} s")
+    return speed
 
 
 def planned(query: Query, *, reverse: bool = False, beyond: bool = False) -> tuple[Plan, Waypoints]:

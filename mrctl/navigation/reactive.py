@@ -80,8 +80,7 @@ class Agent:
         Raises:
             InputError: The plan reverses.
         """
-        if plan.cusps:
-            raise InputError("reference: `window` and `mppi` follow plans that drive forward alone, without cusps")
+        _refuse_reverse(plan)
         count = int(np.ceil(plan.period / self._period)) * SAMPLES_PER_PERIOD + 1
         poses = plan.sample(self._period / SAMPLES_PER_PERIOD * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
@@ -92,7 +91,7 @@ class Agent:
         self.bounds = self.bounds._replace(speed=taken.speed)
         self._take(taken)
         self._replanned = self._approached = False
-        self._pieces = 0
+        self._pieces, self._arrived = 0, np.inf
 
     def _take(self, plan: Waypoints) -> None:
         """Goes along a plan from now on; where the distance field ends before the plan does, makes another field."""
@@ -189,6 +188,21 @@ class Agent:
                 self._take(other)
         return self._pieces > 0
 
+    def has_no_way(self, pose: Array, now: float) -> bool:
+        """Tells whether it stands, with `last` zero: what stands blocks its plan, and a search has found no other.
+
+        Else it would creep towards that, since with the noise of the lidar a small step forward looks free now and
+        then, and no twist leads back.
+
+        Args:
+            pose: x and y in m and θ in rad, `(3,)`.
+            now: Time in s.
+        """
+        blocked = self.planner.hopeless and self.planner.is_blocked(now) and self._waits(now)
+        if stands := blocked and not self._near(pose, now)[:, 2:4].any():
+            self.last = np.zeros(2)
+        return stands
+
     def needs_plan(self, pose: Array, now: float) -> bool:
         """Notes how far it has come, at a time in s; tells whether it needs another plan, and can make one.
 
@@ -242,6 +256,11 @@ class Agent:
                 self._take(other)
 
 
+def _refuse_reverse(plan: Waypoints) -> None:
+    if plan.cusps:
+        raise InputError("reference: `window` and `mppi` follow plans that drive forward alone, without cusps")
+
+
 def reach(discs: Array) -> float:
     """Returns how far from the origin of a robot's frame obstacles matter to discs that cover it, `(k, 3)`, in m."""
     return float((np.hypot(discs[:, 0], discs[:, 1]) + discs[:, 2]).max()) + NEAR_DISTANCE
@@ -267,7 +286,8 @@ class Reactive(ABC):
         followed: What the robots follow, as in `mrctl.control.stages.MotionStage`, `(B, 7)`: the estimated pose, since
             there is no reference pose in time, so that the guard sees no error of the posture; the requested twist at
             the start of the period; and its rate of change over the period.
-        considered: What led to the last twist of each robot; None before the first one, and while it goes back.
+        considered: What led to the last twist of each robot; None before the first one, and while it stands or goes
+            back.
     """
 
     def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
@@ -281,8 +301,15 @@ class Reactive(ABC):
         self._robot, self._size, self._replan = robot, size, replan
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
-        """Takes the missions of the robots, with their maps and with their plans as references."""
+        """Takes the missions of the robots, with their maps and with their plans as references.
+
+        Raises:
+            InputError: A plan, or that of an event, reverses.
+        """
         self._planners = Planner.each(self._replan, scenarios)
+        for planner in self._planners:
+            for plan in planner.plans:
+                _refuse_reverse(plan)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.MotionStage`."""
@@ -325,7 +352,8 @@ class Reactive(ABC):
         now, last = self._period * self._tick, self.last
         for row, (agent, place) in enumerate(zip(self._agents, pose, strict=True)):
             agent.locate(place)
-            if agent.stands(place, float(twist[row, 0]), now) or agent.goes_back(place, now):
+            stands = agent.stands(place, float(twist[row, 0]), now)
+            if stands or agent.goes_back(place, now) or agent.has_no_way(place, now):
                 self.considered[row] = None
             else:
                 scene = agent.scene(place, now)

@@ -65,6 +65,7 @@ class Planner:
 
     Attributes:
         scenario: The mission.
+        plans: The plan of the mission, and those that its events bring.
         first: The plan of the mission.
         sight: What the robot knows of its surroundings.
         vehicle: What its plans need to know of the robot itself.
@@ -81,9 +82,11 @@ class Planner:
         """Takes what makes plans, and the attributes.
 
         Raises:
-            InputError: The reference of the scenario is no plan.
+            InputError: The reference of the scenario, or of one of its events, is no plan.
         """
-        self.scenario, self.first = scenario, open_waypoints(scenario.reference)
+        self.scenario = scenario
+        given = [event.reference for event in scenario.events if event.reference is not None]
+        self.first, *_ = self.plans = [open_waypoints(plan) for plan in (scenario.reference, *given)]
         self.sight, self.vehicle, self._replan = sight, vehicle, replan
         self.reset()
 
@@ -135,6 +138,11 @@ class Planner:
     def is_blocked(self, now: float) -> bool:
         """Tells whether its plan has been blocked for so long, at a time in s, that it is no passing finding."""
         return now - self.blocked >= BLOCKED_TIME
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether the last search found no way."""
+        return self._hopeless is not None
 
     @property
     def goal(self) -> Pose | None:

@@ -24,7 +24,10 @@ KNOTS = 8  # of a roll-out, between which what is added to its twists changes li
 PLACE_COST, HEADING_COST, NEAR_COST, TOUCH_COST = 10.0, 1.0, 5.0, 1000.0
 END_HEADING_COST = 5.0  # 1/s, where the plan has ended: 0.2 rad cost what 0.1 m do, as by `arrived`
 NEAR_DISTANCE = 0.1  # m from obstacles, below which it costs
-MAX_DEEPER = 0.005  # m, by which discs that touch an obstacle already may come nearer
+# m, by which discs that touch an obstacle already may come nearer, and how deep at most; else a robot would come nearer
+# in each period, for the discs reach 1 to 6 cm beyond it
+MAX_DEEPER, DEEPEST = 0.005, 0.01
+ROUNDING = 1e-9  # m, so that staying is not deeper
 WIDER = 1.001  # factor on the squared distance up to which a mover is looked at closely, for rounding
 
 
@@ -40,7 +43,7 @@ class Bounds(NamedTuple):
     acceleration: float
     """Largest |V̇| in m/s²."""
     rotation_acceleration: float
-    """Largest |θ̈| in rad/s², which braking in the tightest curve may exceed."""
+    """Largest |θ̈| in rad/s²."""
 
     @classmethod
     def of(cls, robot: Robot, speed: float) -> Bounds:
@@ -197,15 +200,15 @@ def roll_out(
     targets, discs, field, movers, end, near = scene
     distance, left, low, resolution = field.distance, field.origin[0], field.origin[1], field.resolution
     steps, circle = len(nominal), enclosing_circle(discs)
-    # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
+    # The discs reach beyond the robot, and what it finds is noisy: where they touch already, deeper is a collision.
     x, y, c, s = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2])
     places = np.empty((steps + 1, len(movers), 2))
     for k in range(steps + 1):
         for m in range(len(movers)):
             for i in range(2):
                 places[k, m, i] = movers[m, i] + k * step * movers[m, 2 + i]
-    least = body_clearance(x, y, c, s, 0, circle, discs, distance, left, low, resolution, movers, places)
-    least = least - MAX_DEEPER if least <= 0 else 0.0
+    now = body_clearance(x, y, c, s, 0, circle, discs, distance, left, low, resolution, movers, places)
+    least = min(now - ROUNDING, max(now - MAX_DEEPER, -DEEPEST)) if now <= 0 else 0.0
     rest = np.exp(-step / lag) if lag > 0 else 0.0
     before, shares = np.empty(steps, np.int64), np.empty(steps)  # knot before each step, and share of the one after it
     for k in range(steps):
@@ -220,11 +223,12 @@ def roll_out(
             i, share = before[k], shares[k]
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
             turning = nominal[k, 1] + (1 - share) * knots[n, i, 1] + share * knots[n, i + 1, 1]
-            from_v, from_omega, change = v, omega, bounds.acceleration * step
+            from_v, from_omega = v, omega
+            change, turn_change = bounds.acceleration * step, bounds.rotation_acceleration * step
+            slowest = (abs(omega) - turn_change) / bounds.curvature  # V at which θ̇ has fallen as fast as it can
             fastest = max(bounds.speed, v - change)  # a robot on a slower way than before brakes
-            v = min(max(min(max(wanted, v - change), v + change), 0.0), fastest)
-            change = bounds.rotation_acceleration * step
-            omega = min(max(turning, omega - change), omega + change)
+            v = min(max(wanted, v - change, slowest, 0.0), v + change, fastest)
+            omega = min(max(turning, omega - turn_change), omega + turn_change)
             most = min(bounds.rotation, bounds.curvature * v)
             omega = min(max(omega, -most), most)
             twists[n, k, 0], twists[n, k, 1] = v, omega

@@ -11,8 +11,8 @@ from mrctl.navigation import avoiders
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import navigate
-from mrctl.navigation.mppi import Mppi
-from mrctl.navigation.planning import Avoid, Query, planned, prepared
+from mrctl.navigation.mppi import Mppi, twists_along
+from mrctl.navigation.planning import Avoid, Query, planned, prepared, speed_in_horizon
 from mrctl.navigation.replanning import Planner
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
 from mrctl.navigation.tasks import task_of
@@ -85,8 +85,23 @@ def test_roll_out() -> None:
     assert worth.sum() > 10 and (costs < judged).sum() > 10
 
 
+def test_rotation_falls_no_faster_than_it_can() -> None:
+    """A robot that brakes in its tightest curve creeps on until its θ̇ has fallen, instead of turning on at rest."""
+    bounds, knots = Bounds(0.6, 2.8, 20.0, 0.5, 0.4), np.zeros((2, KNOTS, 2))
+    knots[1, :, 1] = 0.5
+    field = field_of(Surroundings(Obstacles()).at(0.0), np.array([-3.0, -3.0]), np.array([3.0, 3.0]), 0.1)
+    scene = Scene(np.tile([1.0, 0.0, 1.0, 0.0], (STEPS, 1)), cover(FOOTPRINT, 4), field, np.empty((0, 5)))
+    twists, costs, last = np.empty((2, STEPS, 2)), np.empty(2), np.array([0.03, 0.6])
+    state = np.zeros(3), last, last, 0.0, 0.05, bounds, scene
+    roll_out(knots, np.zeros((STEPS, 2)), *state, np.inf, twists, costs)
+    v, omega = twists[0].T
+    np.testing.assert_allclose(omega, np.maximum(0.6 - 0.4 * 0.05 * np.arange(1, STEPS + 1), 0.0), atol=1e-12)
+    np.testing.assert_allclose(v, omega / bounds.curvature, atol=1e-12)  # 0.03 m/s is the V of 0.6 rad/s
+    assert np.abs(np.diff(twists[..., 1], axis=1)).max() <= 0.4 * 0.05 + 1e-12
+
+
 def test_touching_already() -> None:
-    """A robot whose discs touch something already may go on beside it or away, and not deeper."""
+    """A robot whose discs touch something already may go on beside it or away, and not deeper; it may stand."""
     empty = field_of(Surroundings(Obstacles()).at(0.0), np.array([-3.0, -3.0]), np.array([3.0, 3.0]), 0.1)
     targets, body = np.tile([1.0, 0.0, 1.0, 0.0], (STEPS, 1)), np.array([[0.0, 0.0, 0.3]])
     twists, costs = np.empty((2, STEPS, 2)), np.empty(2)
@@ -98,6 +113,14 @@ def test_touching_already() -> None:
         state = np.zeros(3), last, last, 0.0, 0.05, BOUNDS, scene
         roll_out(knots, np.tile(last, (STEPS, 1)), *state, np.inf, twists, costs)
         assert (costs[0] >= 1000) == deeper
+    for depth, step in ((0.002, 0.004), (0.008, 0.001), (0.05, -1e-4)):  # it may end up to 1 cm deep, if it is not yet
+        scene = Scene(targets, body, empty, np.array([[0.3 - depth, 0.0, 0.0, 0.0, 0.0]]))
+        for far, touches in ((step, False), (step + 0.002, True)):
+            request = np.zeros((STEPS, 2))
+            request[0, 0] = far / 0.05  # m/s; it drives half of it in the first step, and half in the second
+            state = np.zeros(3), np.zeros(2), np.zeros(2), 0.0, 0.05, BOUNDS._replace(acceleration=100.0), scene
+            roll_out(np.zeros((1, KNOTS, 2)), request, *state, np.inf, twists[:1], costs[:1])
+            assert (costs[0] >= 1000) == touches, (depth, far)
 
 
 def test_lag() -> None:
@@ -259,6 +282,68 @@ def test_speed_in_sight(seen: float) -> None:
     assert prepared(empty, near, 0.1, avoid="mppi")[1].reference.speed == 0.1
     with pytest.raises(InputError, match="^sensing.lidar: with a range of 0.4 m and a rate of 10 Hz the robot cannot"):
         prepared(empty, PLANNED.replace(sensing={"lidar": {"range": 0.4}}), avoid="mppi")
+
+
+def test_speed_in_horizon() -> None:
+    """A robot with weak brakes is so slow that it can stop within a roll-out, with `window` and `mppi`."""
+    vehicle = Vehicle.of(PLANNED)
+    weak = vehicle._replace(robot=vehicle.robot.replace(max_acceleration=0.2))
+    assert 0.15 + speed_in_horizon(weak) / (0.9 * 0.2) == pytest.approx(STEPS * 0.05)
+
+
+@pytest.mark.parametrize(("avoid", "seconds"), [("window", 16.0), ("mppi", 13.0)])
+def test_no_way_on(avoid: Avoid, seconds: float) -> None:
+    """A car before a wall that its map lacks, with no way around it, stands there; it does not creep into it."""
+    sides = Box(x=2, y=0.6, length=8, width=0.2), Box(x=2, y=-0.6, length=8, width=0.2)
+    ends = Box(x=-2, length=0.2, width=1.4), Box(x=6, length=0.2, width=1.4)
+    world = Obstacles(shapes=(*sides, *ends, Box(x=2.5, length=0.2, width=1.0)))
+    task = Task(obstacles=world, map=Obstacles(shapes=(*sides, *ends)), start=(0, 0, 0), goal=(4, 0, 0))
+    own = prepared(task, PLANNED, avoid=avoid)[1]
+    own = own.replace(goal=None, laps=int(np.ceil(seconds / own.reference.period)))
+    run = simulate([own], motion=avoiding(avoid)).isel(run=0)
+    assert run["failure"] == "" and float(run["time"].max()) > seconds
+    assert float(run["clearance"][-1]) > 0.14 and float(abs(run["v"][-500:]).max()) < 0.01
+
+
+def test_starts_before_a_wall() -> None:
+    """Robots that stand 5 cm before a wall that their maps lack do not touch it."""
+    for robot in ("car", "turtlebot"):
+        scenario = PLANNED.replace(robot=RobotFile(path=robot))
+        wall = Box(x=Vehicle.of(scenario).footprint[:, 0].max() + 0.2, length=0.3, width=2.0)
+        known = Obstacles(shapes=(Box(x=2, y=3.0, length=6, width=0.2),))
+        task = Task(obstacles=Obstacles(shapes=(*known.shapes, wall)), map=known, start=(0, 0, 0), goal=(5, 0, 0))
+        (row,) = navigate(task, scenario, avoid="window").table.itertuples()
+        assert row.outcome == "stuck" and row.clearance > 0.02
+
+
+@pytest.mark.parametrize("goal", [(0.03, -0.12, -0.73), (-0.43, 0.0, -1.67)])
+def test_goal_beside(goal: tuple[float, float, float]) -> None:
+    """With `mppi` a car drives the loop to a goal beside or behind it, about as fast as its plan."""
+    task = Task(obstacles=Obstacles(), start=(0.0, 0.0, 0.0), goal=goal)
+    driven = navigate(task, PLANNED, avoid="mppi")
+    (row,), period = driven.table.itertuples(), prepared(task, PLANNED, avoid="mppi")[1].reference.period
+    assert row.outcome == "arrived" and row.time < period + 0.3
+
+
+def test_twists_along() -> None:
+    """The twists from target to target of a circle are its V and θ̇, across ±π too."""
+    angles = 2.5 + 0.04 * np.arange(STEPS)
+    targets = np.column_stack([0.8 * np.sin(angles), -0.8 * np.cos(angles), np.cos(angles), np.sin(angles)])
+    chord = 2 * 0.8 * np.sin(0.02)
+    np.testing.assert_allclose(twists_along(targets, 0.05), np.tile([chord / 0.05, 0.8], (STEPS, 1)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("avoid", REACTIVE)
+def test_loop_from_where_it_rests(avoid: Avoid) -> None:
+    """A robot that rests at the end of its plan drives another one that ends there."""
+    task = Task(obstacles=Obstacles(), start=(0.0, 0.0, 0.0), goal=(1.0, 0.0, 0.0))
+    own = prepared(task, PLANNED, avoid=avoid)[1]
+    points = ((1.0, 0.0), (1.7, 0.0), (2.2, 0.5), (1.7, 1.0), (1.0, 1.0), (0.3, 0.5), (0.6, 0.03), (1.0, 0.0))
+    loop = Waypoints(points=points, closed=False, timing="limits", speed=0.8)
+    rests = Event(time=own.reference.period + 3.0, reference=loop)
+    laps = int(np.ceil((rests.time + 2.5) / own.reference.period))
+    run = simulate([own.replace(goal=None, laps=laps, events=(rests,))], motion=avoiding(avoid)).isel(run=0)
+    assert run["failure"] == "" and float(run["x"].max()) > 1.8
 
 
 @pytest.mark.parametrize(("turned", "plans"), [(0.15, 0), (0.25, 2)])
@@ -467,10 +552,27 @@ def test_a_way_that_reverses(avoid: Avoid) -> None:
     back = Waypoints(points=points, closed=False, timing="limits", cusps=(2,), speed=0.4)
     task = Task(obstacles=Obstacles(shapes=(Disc(x=3.0, y=2.0, radius=0.2),)), start=(0.0,) * 3, goal=(2.0, 0.0, 0.0))
     own = prepared(task, PLANNED.replace(steering="rigid"), avoid=avoid)[1]
-    result = simulate(own.with_event(Event(time=0.2, reference=back)), motion=avoiding(avoid))
-    failure = result.failure.item()
     if avoid == "barrier":
-        assert not failure and result["v"].min() < -0.1
-    else:
-        assert "follow plans that drive forward alone, without cusps" in failure, failure
-        assert result["time"].max() > 0.1  # what was driven is kept
+        result = simulate(own.with_event(Event(time=0.2, reference=back)), motion=avoiding(avoid))
+        assert result["failure"] == "" and result["v"].min() < -0.1
+        return
+    says = "follow plans that drive forward alone, without cusps"
+    with pytest.raises(InputError, match=says):  # before anything is driven
+        simulate(own.with_event(Event(time=0.2, reference=back)), motion=avoiding(avoid))
+    simulation = mrctl.Simulation([own], motion=avoiding(avoid))
+    for _ in range(20):
+        simulation.step()
+    simulation.add(Event(time=0.25, reference=back))  # known too late for that
+    while simulation.running:
+        simulation.step()
+    result = simulation.result()
+    assert says in result.failure.item() and result["time"].max() > 0.1  # what was driven is kept
+
+
+@pytest.mark.parametrize("avoid", AVOIDERS)
+def test_a_way_without_an_end(avoid: Avoid) -> None:
+    """An event that brings a reference that is no plan is refused before anything is driven."""
+    task = Task(obstacles=Obstacles(), start=(0.0, 0.0, 0.0), goal=(1.0, 0.0, 0.0))
+    own = prepared(task, PLANNED, avoid=avoid)[1].with_event(Event(time=1.0, reference=mrctl.Circle()))
+    with pytest.raises(InputError, match="robots with an avoider follow open waypoints alone"):
+        simulate([own], motion=avoiding(avoid))
