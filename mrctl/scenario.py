@@ -64,7 +64,7 @@ class Event(Record):
     time: Annotated[float, Field(ge=0, le=1e8)]
     """Time of the event in s; it takes effect at the first control tick that is not earlier."""
     perturbation: Perturbation | None = None
-    """Perturbation of the plant from then on, which replaces the previous one."""
+    """Perturbation of the plant from then on, which replaces the previous one, so that what shall stay is repeated."""
     push: tuple[float, float, float] | None = None
     """Push on the chassis: forces along the world's x and y in N, and a torque about z in N·m; pushes that overlap add
     up."""
@@ -121,10 +121,9 @@ class Scenario(Record):
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
     """The robot drives this number of laps."""
     prior: PriorName = "none"
-    """Model of the robot that the feedforward starts from; `true_model` is a yardstick."""
+    """Model that the feedforward starts from; `true_model` has the true constants, for reference."""
     learner: LearnerName = "fel"
-    """Law that adds to the output of the prior, which for `observer`, `indi` and `l1` must be a model; `none` adds
-    nothing."""
+    """Adaptive law, whose output is added to that of the prior. `observer`, `indi` and `l1` need the prior `model`."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, which a tier sets."""
     kanayama: Kanayama = Kanayama()
@@ -164,8 +163,8 @@ class Scenario(Record):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """This seed determines initial offset and weights, and noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=10)] | None = None
-    """Time constant in s of the filter on the velocities that the motion controller adds to the reference, in effect at
-    least the control period; by default designed with the gains."""
+    """Time constant in s of the filter on the velocities that the motion controller adds to the reference; values below
+    the control period act as it. By default it is designed."""
     physics_step: Annotated[float, Field(ge=1e-5, le=0.01)] = 0.002
     """Duration of one physics step in s."""
     control_period: Annotated[float, Field(ge=1e-3, le=0.1)] = 0.01

@@ -21,7 +21,7 @@ from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 def view_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `view` command, which takes the scenario flags of `run`.
 
-    Without a file and a choice of controllers, the best learner is shown beside PID alone. A robot that is chosen
+    Without a file and a choice of controllers, `model+composite` is shown beside PID alone. A robot that is chosen
     without its steering or a reference brings those that suit it.
     """
     asked = arguments[0] == "view"
@@ -46,7 +46,7 @@ def view_with(arguments: list[str]) -> Callable[..., None]:
 
         Args:
             file: Scenario file, whose values flags override, or result of `mrctl run --out` or `mrctl sweep`; by
-                default the best learner and PID alone, live.
+                default model+composite and PID alone, live.
             scenario: The scenario. A robot brings the steering and the reference that suit it, unless they are given.
                 Without --prior, --learner and --compare, model+composite drives beside PID alone; with one of them,
                 the defaults are those of `mrctl run`. A live session goes on after the last lap.

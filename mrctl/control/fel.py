@@ -244,8 +244,8 @@ class Fel(Record):
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
     """Number of hidden tanh units."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.01
-    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward; on a
-    steering channel a tenth of this number. The default is what `mrctl tune --search` found in `lab`, with and without
+    """Normalised step μ: share of the feedback voltage that the feedforward takes over in each control period; for
+    `rigid` steering a tenth of this number. The default is what `mrctl tune --search` found in `lab`, with and without
     the model as prior."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
     """Feedback in V below which nothing is learned; on a steering channel, a tenth of this number in rad/s."""

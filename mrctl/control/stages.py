@@ -81,6 +81,9 @@ class MotionStage(Protocol):
 class FeedbackStage(Protocol):
     """The velocity controller without its feedforward; it is called once in a control period.
 
+    It is not told the voltage that is applied, only `excess`. The twist is predicted over the delay with the commanded
+    accelerations; `mrctl.control.matching` says how to match it with the output that made it.
+
     It may have a member `integral`, a float64 array `(B, 2)`. The hierarchy then subtracts from it a share of what a
     learner adds to the feedforward, and the guard sets it at the beginning of a fallback.
     """

@@ -96,20 +96,20 @@ def _motion(p: Plane, *rest: ArrayLike) -> Motion:
 
 
 class Line(Record):
-    """A straight line at constant speed, which goes on after its length."""
+    """A straight line at constant speed. `length` sets the length of a lap; the line itself goes on."""
 
     kind: Literal["line"] = "line"
     """Kind of the reference."""
     speed: Speed = 0.8
     """Speed along the line in m/s."""
     length: Length = 8.0
-    """Length of one pass in m."""
+    """Length of a lap in m."""
     heading: Annotated[float, Field(ge=-np.pi, le=np.pi)] = 0.0
     """Direction of the line in rad, counter-clockwise from +x."""
 
     @property
     def period(self) -> float:
-        """Time of one pass in s."""
+        """Time of a lap in s."""
         return self.length / self.speed
 
     def sample(self, t: Array) -> Motion:

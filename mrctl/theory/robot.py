@@ -164,7 +164,11 @@ class Robot(Record):
 
     @property
     def rotation_gain(self) -> float:
-        """Static gain of the differential channel, θ̇ per commanded U_Δ, in rad/s/V."""
+        """Static gain of the differential channel, θ̇ per commanded U_Δ, in rad/s/V.
+
+        It is that of equation (3) at V = 0 with a steering that turns along, right for a feedforward. A feedback, whose
+        correction the steering servo resists, sees less; `mrctl tune ROBOT` prints the plant that it sees.
+        """
         return self.velocity_gain / self.half_track
 
     @property
@@ -174,7 +178,7 @@ class Robot(Record):
 
     @property
     def rotation_time_constant(self) -> float:
-        """Time constant of θ̇ under U_Δ in s."""
+        """Time constant of θ̇ under U_Δ in s, for a feedforward, as `rotation_gain`."""
         damping = 2 * self.half_track**2 * self.motor_gain * self.back_emf / self.wheel_radius**2
         return self.effective_inertia / damping
 

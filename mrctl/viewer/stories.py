@@ -1,4 +1,4 @@
-"""Three scenes to watch: in each, PID alone and the best learner meet the same events."""
+"""Three scenes to watch: in each, PID alone and `model+composite` meet the same events."""
 
 from __future__ import annotations
 
