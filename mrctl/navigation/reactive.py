@@ -70,7 +70,7 @@ class Agent:
         self._anchor = start.copy()  # where it last was when it had got on
         self._replanned = False  # whether it has made another plan since
         self._arrived = np.inf  # when it arrived at the end of its plan
-        self._trail = Trail(planner.vehicle.footprint, bounds.curvature)
+        self._trail = Trail(planner.vehicle.footprint, bounds.curvature, bounds.acceleration)
         self._pieces = 0  # of the way back from `_anchor`, while it goes back
         self._approached = False  # whether it has gone back from a goal at which it did not arrive
 

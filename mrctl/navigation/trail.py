@@ -25,14 +25,16 @@ CHECKED_BEHIND = 0.1  # distance in m by which it looks ahead on its way back wh
 class Trail:
     """The way that one robot came."""
 
-    def __init__(self, footprint: Array, curvature: float) -> None:
+    def __init__(self, footprint: Array, curvature: float, acceleration: float) -> None:
         """Begins an empty trail.
 
         Args:
             footprint: Corners of the robot in its frame in m, `(n, 2)`.
             curvature: Largest |θ̇| / |V| in 1/m.
+            acceleration: Largest |V̇| in m/s², with which the robot brakes.
         """
         self._footprint, self._curvature = footprint, curvature
+        self._fastest = np.sqrt(2 * acceleration * CHECKED_BEHIND)  # it then stops within what it looks ahead
         self._places = deque[Array](maxlen=MAX_PLACES)
 
     def add(self, pose: Array) -> None:
@@ -45,7 +47,7 @@ class Trail:
 
         Args:
             pose: x and y in m and θ in rad, `(3,)`.
-            speed: Speed in m/s with which it goes back.
+            speed: Speed in m/s with which it goes back, if it can stop from that within `CHECKED_BEHIND`.
             outlines: The obstacles.
 
         Returns:
@@ -60,4 +62,4 @@ class Trail:
         curvature = np.clip(2 * y / (x * x + y * y), -self._curvature, self._curvature)
         if clearance(self._footprint, pose - CHECKED_BEHIND * np.array([c, s, curvature]), outlines) <= 0:
             return None
-        return -speed * np.array([1.0, curvature])
+        return -min(speed, self._fastest) * np.array([1.0, curvature])
