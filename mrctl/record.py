@@ -14,7 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
+from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 from typing_extensions import override
 
 from mrctl import __version__
@@ -85,6 +87,21 @@ def printable(text: str) -> str:
     return words if len(words) <= 2000 else f"{words[:1000]} … {words[-900:]}"
 
 
+def bounds(field: FieldInfo) -> dict[type, float]:
+    """Returns the limits of a number by the kind of comparison, `Ge`, `Gt`, `Le` or `Lt`."""
+    return {type(m): getattr(m, type(m).__name__.lower()) for m in field.metadata if isinstance(m, Ge | Gt | Le | Lt)}
+
+
+def with_limits(description: str, field: FieldInfo) -> str:
+    """Returns the description of a field with its limits, if it is a number that has both and does not say them yet."""
+    limits, words = bounds(field), {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
+    if len(limits) < 2:
+        return description
+    said = ", ".join(f"{words[kind]} {limits[kind]:.12g}" for kind in words if kind in limits)
+    added = f"{said.capitalize()}."
+    return description if description.endswith(added) else f"{description} {added}".lstrip()
+
+
 class _Constructors(ModelMetaclass):
     """Lets the constructors of records refuse bad fields as `Record.from_dict` does.
 
@@ -126,12 +143,12 @@ class Record(BaseModel, metaclass=_Constructors):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Makes each field's docstring one line and adds it to that of the class, so that `help` explains the field."""
+        """Makes each field's docstring one line with its limits, and adds it to that of the class, for `help`."""
         super().__pydantic_init_subclass__(**kwargs)
         lines = []
         for name, field in cls.model_fields.items():
             if field.description:
-                field.description = " ".join(field.description.split())
+                field.description = with_limits(" ".join(field.description.split()), field)
                 text = f"{name}: {field.description}"
                 lines.append(textwrap.fill(text, 112, initial_indent=4 * " ", subsequent_indent=8 * " "))
         if lines and cls.__doc__:

@@ -11,7 +11,7 @@ import pydantic
 import tyro
 
 from mrctl.cli.arguments import FROM_FILES, NOT_OF_MISSIONS, WITH_RECORDS
-from mrctl.record import Record
+from mrctl.record import Record, with_limits
 from mrctl.scenario import Scenario
 
 EXPLAINED_FIELDS = ("name", "world", "steering", "reference", "laps", "prior", "learner", "seed")
@@ -71,7 +71,8 @@ def further_flags(command: str) -> str:
     for name in names:
         field = Scenario.model_fields[name]
         flag = f"--{name.replace('_', '-')}" + (".*" if isinstance(field.default, Record) else "")
-        lines += textwrap.wrap(field.description or "", 80, initial_indent=f"  {flag:<17} ", subsequent_indent=" " * 20)
+        text = (field.description or "").removesuffix(with_limits("", field))
+        lines += textwrap.wrap(text, 80, initial_indent=f"  {flag:<17} ", subsequent_indent=" " * 20)
     if command in ("run", "view"):
         lines.append(f"`mrctl {command} reference:circle --help` lists the flags of a reference, here of a circle.")
     return "\n".join(lines)

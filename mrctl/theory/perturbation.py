@@ -40,64 +40,61 @@ class Perturbation(Record):
     }
 
     mass_factor: Factor = 1.0
-    """Factor on mass and inertia of every body, 0.05 to 20."""
+    """Factor on mass and inertia of every body."""
     inertia_factor: Factor = 1.0
-    """Factor on the yaw inertia of the chassis, whose mass stays, 0.05 to 20."""
+    """Factor on the yaw inertia of the chassis, whose mass stays."""
     payload: Annotated[float, Field(ge=0, le=200)] = 0.0
-    """Payload on the chassis in kg, a point mass, 0 to 200."""
+    """Payload on the chassis in kg, a point mass."""
     payload_x: Annotated[float, Field(ge=-1, le=1)] = 0.1
-    """Position of the payload ahead of the rear axle in m, −1 to 1."""
+    """Position of the payload ahead of the rear axle in m."""
     payload_y: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    """Position of the payload to the left of the robot's axis in m, −1 to 1."""
+    """Position of the payload to the left of the robot's axis in m."""
     payload_z: Annotated[float, Field(ge=0, le=1)] = 0.2
-    """Height of the payload above the ground in m, 0 to 1."""
+    """Height of the payload above the ground in m."""
     left_radius_factor: Annotated[float, Field(ge=0.8, le=1.2)] = 1.0
-    """Factor on the radius of the rear left wheel, 0.8 to 1.2."""
+    """Factor on the radius of the rear left wheel."""
     right_radius_factor: Annotated[float, Field(ge=0.8, le=1.2)] = 1.0
-    """Factor on the radius of the rear right wheel, 0.8 to 1.2."""
+    """Factor on the radius of the rear right wheel."""
     drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
-    """Factor on the friction of gearboxes and motors, τ_loss, 0 to 20."""
+    """Factor on the friction of gearboxes and motors, τ_loss."""
     resistance_factor: Factor = 1.0
-    """Factor on the motors' terminal resistance R_a, 0.05 to 20."""
+    """Factor on the motors' terminal resistance R_a."""
     motor_constant_factor: Factor = 1.0
-    """Factor on the motor constants k_M and k_E together, 0.05 to 20."""
+    """Factor on the motor constants k_M and k_E together."""
     left_drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
-    """Further factor on the friction of the left gearbox and motor, 0 to 20."""
+    """Further factor on the friction of the left gearbox and motor."""
     right_drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
-    """Further factor on the friction of the right gearbox and motor, 0 to 20."""
+    """Further factor on the friction of the right gearbox and motor."""
     left_resistance_factor: Factor = 1.0
-    """Further factor on the resistance of the left motor, 0.05 to 20."""
+    """Further factor on the resistance of the left motor."""
     right_resistance_factor: Factor = 1.0
-    """Further factor on the resistance of the right motor, 0.05 to 20."""
+    """Further factor on the resistance of the right motor."""
     left_motor_constant_factor: Factor = 1.0
-    """Further factor on the constants k_M and k_E of the left motor, 0.05 to 20."""
+    """Further factor on the constants k_M and k_E of the left motor."""
     right_motor_constant_factor: Factor = 1.0
-    """Further factor on the constants k_M and k_E of the right motor, 0.05 to 20."""
+    """Further factor on the constants k_M and k_E of the right motor."""
     dead_zone: DeadZone = 0.0
-    """Voltage in V that is added to the dead zone of the motor driver, below which a command has no effect; 0 to 10."""
+    """Voltage in V that is added to the dead zone of the motor driver, below which a command has no effect."""
     pwm_steps: PwmSteps = 0
-    """Upper bound on the driver's PWM steps up to the full supply; 0 keeps the driver's own. At most 65536."""
+    """Upper bound on the driver's PWM steps up to the full supply; 0 keeps the driver's own."""
     current_limit: CurrentLimit = NO_LIMIT
-    """Current limit of each motor in A, if that of the driver is higher; 1000 A, the default, stands for no limit. At
-    least 0.1 A."""
+    """Current limit of each motor in A, if that of the driver is higher; 1000 A, the default, stands for no limit."""
     battery_resistance: BatteryResistance = 0.0
-    """Resistance in Ω that is added to that of the battery, so that the motors' currents lower its voltage further; 0
-    to 2."""
+    """Resistance in Ω that is added to that of the battery, so that the motors' currents lower its voltage further."""
     steering_offset: Offset = 0.0
-    """Angle in rad that is added to the constant error of the fork's angle, positive to the left; −0.5 to 0.5."""
+    """Angle in rad that is added to the constant error of the fork's angle, positive to the left."""
     steering_backlash: Backlash = 0.0
-    """Width in rad that is added to the backlash between the steering servo and the fork, 0 to 0.5."""
+    """Width in rad that is added to the backlash between the steering servo and the fork."""
     supply_factor: Annotated[float, Field(ge=0.05, le=2)] = 1.0
-    """Factor on the supply voltage and, since the driver works by PWM, on every applied voltage; 0.05 to 2."""
+    """Factor on the supply voltage and, since the driver works by PWM, on every applied voltage."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
-    """Factor on the friction of every tyre on the floor, 0.01 to 3."""
+    """Factor on the friction of every tyre on the floor."""
     left_tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
-    """Further factor on the friction of the rear left tyre, 0.01 to 3."""
+    """Further factor on the friction of the rear left tyre."""
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
-    """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor; −0.5 to 0.5."""
+    """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=MAX_DELAY)] = 0.0
-    """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period, 0 to
-    0.5."""
+    """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""
 
     @model_validator(mode="before")
     @classmethod

@@ -12,7 +12,7 @@ import viser
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic.fields import FieldInfo
 
-from mrctl.record import Record
+from mrctl.record import Record, bounds, with_limits
 from mrctl.sensing.tiers import START, TIER_VALUES, Sensing
 from mrctl.theory.robot import Robot
 from mrctl.viewer.slider_ranges import Interval, slider_range
@@ -187,12 +187,7 @@ class Controls:
 
         A page moves a number beyond them to the nearest one.
         """
-        known = field.description or ""
-        bounds = _bounds(_kind(field))
-        if len(bounds) == 2:
-            words = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
-            limits = ", ".join(f"{words[kind]} {bounds[kind]:.12g}" for kind in words if kind in bounds)
-            known = f"{known} {limits.capitalize()}.".lstrip()
+        known = with_limits(field.description or "", _kind(field))
         return known if path[0] in self._changeable else f"{known} {NEW_RUN_HINT}".lstrip()
 
     def _listen(self, path: tuple[str, ...], handle: Any, whole: bool = False) -> None:  # noqa: ANN401
@@ -311,21 +306,16 @@ def _kinds(field: FieldInfo) -> dict[str, type[Record]]:
     return {k.model_fields["kind"].default: k for k in typing.get_args(field.annotation) if field.discriminator}
 
 
-def _bounds(field: FieldInfo) -> dict[type, float]:
-    """Returns the limits of a number by the kind of comparison, `Ge`, `Gt`, `Le` or `Lt`."""
-    return {type(m): getattr(m, type(m).__name__.lower()) for m in field.metadata if isinstance(m, Ge | Gt | Le | Lt)}
-
-
 def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None:
     """Returns lower limit, upper limit and a suitable step of an input, or None for a field without both limits."""
-    bounds = _bounds(field)
-    low, high = bounds.get(Ge, bounds.get(Gt)), bounds.get(Le, bounds.get(Lt))
+    limits = bounds(field)
+    low, high = limits.get(Ge, limits.get(Gt)), limits.get(Le, limits.get(Lt))
     if low is None or high is None:
         return None
     if field.annotation is int:
-        return float(low + (Gt in bounds)), float(high - (Lt in bounds)), 1.0
+        return float(low + (Gt in limits)), float(high - (Lt in limits)), 1.0
     step = _step(high - low, value)
-    return float(low + step * (Gt in bounds)), float(high - step * (Lt in bounds)), step
+    return float(low + step * (Gt in limits)), float(high - step * (Lt in limits)), step
 
 
 def _step(width: float, value: float) -> float:
