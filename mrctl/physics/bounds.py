@@ -55,11 +55,11 @@ SUFFIXES = {suffix: 1024.0**power for power, suffix in enumerate("KMGTPE", start
 
 
 @contextlib.contextmanager
-def compiling(path: str | Path) -> Iterator[None]:
+def compiling(path: str | Path, *others: str | Path) -> Iterator[None]:
     """Turns what MuJoCo raises on a model that it cannot compile into one line that names the file.
 
-    Besides `ValueError` these are `MemoryError`, and `RuntimeError` or MuJoCo's `FatalError` where a library under it
-    fails. Errors of Python, which are others, pass.
+    A line that names one of the other files stays as it is. Besides `ValueError` these are `MemoryError`, and
+    `RuntimeError` or MuJoCo's `FatalError` where a library under it fails. Errors of Python, which are others, pass.
 
     Raises:
         InputError: MuJoCo cannot compile the model.
@@ -70,7 +70,8 @@ def compiling(path: str | Path) -> Iterator[None]:
         if not isinstance(error, (ValueError, MemoryError, RuntimeError)) and type(error).__name__ != "FatalError":
             raise
         text = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
+        named = text.startswith(tuple(f"{file}: " for file in (path, *others)))
+        raise InputError(text if named else f"{path}: {text}") from None
 
 
 def check_bounds(path: Path) -> None:
