@@ -311,10 +311,16 @@ def test_bad_scenario_is_one_line(
         (["navigate", "doorway:1", "--perturbation.mas", "2"], "did you mean --perturbation.mass-factor?"),
         (["check", "--robot.path", "mule.xml"], "--robot.path: is no flag of mrctl check"),
         (["run", "reference:circle", "--laps", "1"], "--laps: is no flag of reference:circle, and those of mrctl run"),
-        (["navigate", "doorway:1", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
-        (["run", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
+        (["navigate", "doorway:1", "mule.xml"], "mule.xml: the file of a robot is given as --robot.path mule.xml"),
+        (["run", "mule.xml"], "mule.xml: the file of a robot is given as --robot.path mule.xml"),
         (["navigate", "doorway:1", "--sensing.lidar.nois", "3"], "did you mean --sensing.lidar.noise?"),
         (["run", "--lapz=3"], "no flag is called --lapz"),
+        (["run", "--pertubation", "all"], "no flag is called --pertubation; did you mean --perturbation?"),
+        (
+            ["navigate", "doorway:1", "--controller", "a.py:A"],
+            "controller: a mission of this command drives with those",
+        ),
+        (["view", "--controller=a.py:A"], "controller: a live session drives with those of mrctl; with your own, give"),
         (["run", "--out"], "out: needs a value; see mrctl run --help"),
         (["sweep"], "SWEEP.toml, --out PATH: missing; see mrctl sweep --help"),
         (["record", "run"], "--out PATH: missing; see mrctl record --help"),
@@ -483,6 +489,16 @@ def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     for flag in every.keys() - short.keys():
         name = flag.split()[0].rstrip(",")
         assert re.search(rf"^  {re.escape(re.sub(r'[.].*', '.*', name))} ", screen, re.MULTILINE), flag
+
+
+def test_defaults_of_navigate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """The help says that `--learner` alone takes the prior away, and the other way round."""
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        cli.main(["navigate", "--help"])
+    screen = " ".join(capsys.readouterr().out.split())
+    assert "(default: model, or none where --learner is given)" in screen
+    assert "(default: composite, or fel where --prior is given)" in screen
 
 
 def test_short_help_of_identify(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
