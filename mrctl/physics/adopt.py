@@ -84,6 +84,11 @@ class _Adoption:
         self.chassis = self._carrier(robot.chassis, wheels)
         self.ahead, self.left = self._directions(wheels, steered)
         places = {name: self._on_axle(name) for name in wheels}
+        between = places[wheels[1]] - places[wheels[0]]
+        if abs(between @ self.left) <= 0.5 * np.linalg.norm(between):
+            raise InputError(
+                f"wheels: the axes of the joints {_listed(wheels)} must point along the line through the two wheels"
+            )
         self.origin = np.mean([*places.values()], axis=0)
         self.wheels = sorted(wheels, key=lambda name: -float((places[name] - self.origin) @ self.left))
         self.steered = sorted(steered, key=self._side)

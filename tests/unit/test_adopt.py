@@ -502,6 +502,7 @@ PLAIN = '<velocity name="drive" joint="a"/>' + MOTOR.format("b", 30, "")
 WARM = 'inductance="1e-4 0" thermal="1 10 20 20 0.004 0.1"'
 TRIPLE = MOTORS + MOTOR.format("c", 30, "")
 ERRORS = {
+    "axes across": (document(DIFF.replace("0 1 0", "1 0 0"), MOTORS), {}, ("'a', 'b' must point along",)),
     "no motors": (document(DIFF, ""), {}, ("wheels", "dcmotor", "'a', 'b'")),
     "three motors": (document(TRICYCLE, TRIPLE + SERVO.format("s1")), {}, ("wheels", "3 joints")),
     "another motor": (document(DIFF, PLAIN), {"wheels": ("a", "b")}, ("motor", "'a'", "'drive'", "<dcmotor joint=")),
