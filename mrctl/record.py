@@ -131,6 +131,8 @@ class Record(BaseModel, metaclass=_Constructors):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
     moved: ClassVar[dict[str, str]] = {}
     """Fields of earlier versions, each with the advice what to set in its place."""
+    foreign: ClassVar[dict[str, str]] = {}
+    """Fields of other records whose files may be taken for those of this one, each with what its record is for."""
     named_by: ClassVar[str] = ""
     """Field that a string sets which stands in the place of a record; by default none does."""
 
@@ -171,6 +173,8 @@ class Record(BaseModel, metaclass=_Constructors):
     def _knows_moved_fields(cls, values: Any) -> Any:  # noqa: ANN401
         for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
             raise ValueError(f"{name}: {FIELD_GONE}; {cls.moved[name]}")
+        for name in (one for one in cls.foreign if isinstance(values, dict) and one in values):
+            raise ValueError(f"{name}: {cls.foreign[name]}")
         return values
 
     @classmethod
@@ -312,6 +316,12 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})
         message = f"'kind' is {context.get('tag')!r}, which is none of {context.get('expected_tags')}"
+    kinds = [
+        one.model_fields["kind"].default for one in _records_at(record, first["loc"]) if "kind" in one.model_fields
+    ]
+    if len(kinds) > 1 and first["type"] in ("model_type", "model_attributes_type"):
+        kind = first["input"] if first["input"] in kinds else kinds[0]
+        message += f', such as {{ kind = "{kind}" }}'
     if first["type"] == "missing" and isinstance(first["loc"][-1], int):
         field, message = field.rpartition(".")[0], f"has {len(first['input'])} values, which are too few"
     if first["type"] == "too_long":

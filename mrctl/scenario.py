@@ -101,6 +101,16 @@ class Scenario(Record):
         "feedforward": "set prior and learner, such as prior model and learner composite",
     }
 
+    foreign = {
+        "shapes": "is a field of obstacles; `mrctl navigate FILE --goal X,Y,θ` drives among them, and "
+        'obstacles = "FILE" in a scenario names them',
+        **dict.fromkeys(
+            ("base", "axes", "runs"), "is a field of a sweep, which `mrctl sweep FILE --out FOLDER` computes"
+        ),
+        "controller": "a scenario names no controller of your own; `mrctl run FILE --controller NAME.py:NAME` drives "
+        "with one, and a sweep has a field controller",
+    }
+
     name: str = ""
     """Tables and figures give the run this label; by default that of the feedforward."""
     world: str = "flat"

@@ -19,7 +19,7 @@ from mrctl.checks.open_loop import ending
 from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import has
 from mrctl.physics.files import SHIPPED, world_path
-from mrctl.physics.mjcf import arrangement, load, load_robot, steerings
+from mrctl.physics.mjcf import REQUIRED, arrangement, load, load_robot, steerings
 
 MAX_SECONDS = 28.0  # s by the clock for loading, all checks and explanations; those that are left then fail
 UNEXPLAINED = "no inspection explains this, nor does a shorter time step"
@@ -54,7 +54,8 @@ def _is_world(path: str) -> bool:
     world = world_path(path)
     with compiling(path):
         model = mujoco.MjModel.from_xml_path(str(world))
-    return model.npair > 0 and has(model, "geom", "wheel_left")
+    parts = all(has(model, kind, name) for kind, names in REQUIRED.items() for name in names)
+    return has(model, "geom", "wheel_left") and (model.npair > 0 or (parts and has(model, "geom", "floor")))
 
 
 def run(

@@ -30,6 +30,14 @@ FLAGS_ELSEWHERE = {
 }  # fmt: skip
 """Flags of `check` and `tune`, and what they are called in the commands of `WITH_RECORDS`."""
 
+CONTROLLER_ELSEWHERE = {
+    "navigate": "a mission of this command drives with those of mrctl; with your own, simulate what "
+    "mrctl.navigation.planning.prepared returns",
+    "view": "a live session drives with those of mrctl; with your own, give mrctl run --controller and --out FOLDER, "
+    "then mrctl view FOLDER",
+}
+"""Commands without controllers of the user, and what to do instead."""
+
 POSE_FLAGS = "--goal", "--start", "--initial-pose"
 """Flags whose values may be written as x,y,θ."""
 
@@ -102,7 +110,7 @@ def scenario_file_of(arguments: Sequence[str]) -> str | None:
 
 
 def refuse_known(arguments: Sequence[str]) -> None:
-    """Refuses flags of a scenario's fields that have none, or that had one in an earlier version.
+    """Refuses flags of a scenario's fields that have none, or had one in an earlier version, and --controller.
 
     Raises:
         InputError: There is such a flag; the message says what to do in its place.
@@ -112,6 +120,8 @@ def refuse_known(arguments: Sequence[str]) -> None:
     for place, flag in enumerate(arguments):
         if flag.startswith("--"):
             name = flag[2:].partition("=")[0].replace("-", "_")
+            if name == "controller" and arguments[0] in CONTROLLER_ELSEWHERE:
+                raise InputError(f"controller: {CONTROLLER_ELSEWHERE[arguments[0]]}")
             Scenario.refuse_moved(name)
             behind = any(before.startswith("reference:") for before in arguments[:place])
             if arguments[0] in ("run", "view") and name.split(".")[0] == "reference" and not behind:
@@ -193,7 +203,8 @@ def one_line(box: str, command: str) -> str:
                 similar.append(flag)
         # Of flags that end alike tyro lists first the one of the reference that is chosen.
         inner = [flag for flag in similar if flag.endswith(f".{match[1].removeprefix('--')}")]
-        meant = inner[0] if inner else nearest(match[1], similar)
+        groups = ["--perturbation", *SHORT_FLAGS] if command in WITH_RECORDS else []
+        meant = inner[0] if inner else nearest(match[1], similar) or nearest(match[1], groups)
         return f"no flag is called {match[1]}" + (f"; did you mean {meant}?" if meant else "")
     if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
         if match[3]:
@@ -206,7 +217,7 @@ def one_line(box: str, command: str) -> str:
     if command in ("run", "view") and (match := re.match(r"Unrecognized options: (\S+\.toml)", text)):
         return f"{match[1]}: one scenario file may be given, in front of the reference"
     if match := re.match(r"Unrecognized options: (\S+\.xml)", text):
-        return f"{match[1]}: the file of a robot is given as --robot {match[1]}"
+        return f"{match[1]}: the file of a robot is given as --robot.path {match[1]}"
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
         return text
     parts = match[1].removeprefix("--").split(".")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import pydantic
@@ -37,9 +37,17 @@ def explained(arguments: Sequence[str]) -> Sequence[str]:
     return [name for name in Scenario.model_fields if name not in FROM_FILES] if asked else ()
 
 
-def partial_record(scenario: Scenario, names: Sequence[str]) -> Record:
-    """Returns a record of some fields of a scenario, from which tyro makes flags."""
+def partial_record(scenario: Scenario, names: Sequence[str], defaults: Mapping[str, str] | None = None) -> Record:
+    """Returns a record of some fields of a scenario, from which tyro makes flags.
+
+    Args:
+        scenario: Its values are the defaults.
+        names: The fields.
+        defaults: What the help says of the defaults of some of them.
+    """
     types = typing.get_type_hints(Scenario, include_extras=True)
+    for name, text in (defaults or {}).items():
+        types[name] = Annotated[types[name], tyro.conf.arg(help_behavior_hint=f"(default: {text})")]
     helps = {name: field.description for name, field in Scenario.model_fields.items()}
     fields: dict[str, Any] = {
         name: (types[name], pydantic.Field(getattr(scenario, name), description=helps[name])) for name in names

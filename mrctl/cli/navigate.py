@@ -14,12 +14,17 @@ from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, show, w
 from mrctl.record import InputError, Record
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
+DEFAULTS = {
+    "prior": "model, or none where --learner is given",
+    "learner": "composite, or fel where --prior is given",
+}
+
 
 def navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out the same fields as that of `run`."""
     names = EXPLAINED_FIELDS if is_short_help(arguments) else Scenario.model_fields
     default = Scenario() if {"prior", "learner"} & fields_set(arguments) else Scenario(**FEEDFORWARDS[BEST])
-    part = partial_record(default, [name for name in names if name not in NOT_OF_MISSIONS])
+    part = partial_record(default, [name for name in names if name not in NOT_OF_MISSIONS], DEFAULTS)
 
     def navigate(
         world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[WORLD|GENERATOR:SEED|MISSION]")] = "",
@@ -68,8 +73,9 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
             view: Instead of a table, show the mission live in the browser, where clicks set further goals.
             port: Number of the port to listen on, with --view.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
-                model, fel and model+composite, on three plants; then drive MPPI around obstacles, with and without a
-                lag in its model, over PID and over model+composite; then plan with what model+composite has learned.
+                model, fel and model+composite, on three plants; then how narrow it may be with `window`, for a robot
+                that sees the walls; then drive MPPI around obstacles, with and without a lag in its model, over PID and
+                over model+composite; then plan with what model+composite has learned.
                 Each part prints first how long it takes. The tables are written to --out, by default navigate_suite,
                 where the same command goes on if it was stopped.
             quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.

@@ -89,7 +89,7 @@ def _once() -> Callable[..., None]:
         text = printable(str(message))
         if text not in said:
             said.add(text)
-            print(f"mrctl: {text}", file=sys.stderr)
+            print(f"mrctl: warning: {text}", file=sys.stderr)
 
     return show
 

@@ -52,7 +52,7 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
         if file is not None and str(file) != scenario_file:
             check_switches(arguments)
             if file.suffix == ".xml":
-                raise InputError(f"{file}: the file of a robot is given as --robot {file}")
+                raise InputError(f"{file}: the file of a robot is given as --robot.path {file}")
             forms = "whose name ends in .toml, nor a reference, which is written as reference:circle"
             raise InputError(f"run: {file} is not a scenario file, {forms}; see mrctl run --help")
         check_world(scenario.world, scenario.robot)

@@ -44,7 +44,8 @@ def warn_if_impossible(scenario: Scenario) -> None:
 
     scenario = arranged(scenario)
     for cause in impossible(load(scenario.world, scenario.steering, robot=scenario.robot)):
-        print(f"mrctl: {printable(f'{file}: {cause.cause}: {cause.text}; see mrctl check {file}')}", file=sys.stderr)
+        text = printable(f"{file}: {cause.cause}: {cause.text}; see mrctl check {file}")
+        print(f"mrctl: warning: {text}", file=sys.stderr)
 
 
 def check_exists(file: Path) -> None:

@@ -142,7 +142,10 @@ def read_arrays(path: str | Path, field: str, expected: Mapping[str, tuple[int, 
         InputError: The file is missing, broken, of other shapes, or holds non-finite numbers.
     """
     if not Path(path).is_file():
-        raise InputError(f"{field}: no file {path}")
+        inside = Path(path) / "learned.safetensors"
+        raise InputError(
+            f"{field}: " + (f"{path} is a folder; give {inside}" if inside.is_file() else f"no file {path}")
+        )
     size = Path(path).stat().st_size
     if zipfile.is_zipfile(path):  # as torch writes them
         with reading(path), zipfile.ZipFile(path) as archive:

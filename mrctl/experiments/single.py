@@ -13,6 +13,7 @@ from mrctl.control.stages import Stages
 from mrctl.experiments.tables import Report, json_text, markdown, number, output_folder
 from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
+from mrctl.loop.hierarchy import MAX_LEARNING_SLIP
 from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.learned import save_learned
 from mrctl.loop.runs import simulate
@@ -20,8 +21,9 @@ from mrctl.loop.user_stages import named_stages
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.dataset import departure, faults_of, save, scenarios_of, versions
-from mrctl.scenario import Scenario
+from mrctl.scenario import MODEL_BASED, Scenario
 from mrctl.sweep import store
+from mrctl.theory.perturbation import Perturbation
 
 COLUMNS = {
     "longitudinal_rmse": ("longitudinal, mm", 1e3),
@@ -33,7 +35,7 @@ COLUMNS = {
     "feedback_share": ("RMS(U_fb)/RMS(U)", 1.0),
     "saturation_time": ("saturated, s", 1.0),
     "energy": ("energy, J", 1.0),
-    "guard_actions": ("guard acted", 1.0),
+    "guard_actions": ("guard acted, times", 1.0),
 }
 
 FIGURES = {  # file: function of `results.plots`
@@ -147,8 +149,9 @@ def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
     ]
     lines += [f"failed {failure}"] if failure else []
     lines += faults_of(run) + _limited(run) + _unreached(scenario, run)
+    lines += _taken_back(scenario) + _slipped(scenario, run)
     rows = [
-        [str(k + 1), *(number(scale * float(laps[name].values[k])) for name, (_, scale) in COLUMNS.items())]
+        [str(k + 1), *(_cell(name, scale * float(laps[name].values[k])) for name, (_, scale) in COLUMNS.items())]
         for k in np.flatnonzero(np.isfinite(laps["position_rmse"].values))
     ]
     if rows:
@@ -156,6 +159,42 @@ def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
     for _, time, action, why in metrics.guard_events(run).itertuples(index=False):
         lines.append(f"guard at {time:.2f} s: {action}, {why}".removesuffix(", "))
     return "\n".join(lines + _retuned(run))
+
+
+def _cell(name: str, value: float) -> str:
+    """Returns a metric as text; what is counted is a whole number."""
+    return f"{value:.0f}" if name == "guard_actions" else number(value)
+
+
+def _taken_back(scenario: Scenario) -> list[str]:
+    """Says which differences of the plant an event takes back as it brings others, because it replaces them all."""
+    plain, before, lines = Perturbation(), scenario.perturbation, []
+    for event in scenario.schedule:
+        if (now := event.perturbation) is None or event.time >= scenario.duration:
+            continue
+        names = [
+            name for name in Perturbation.model_fields
+            if getattr(before, name) != getattr(now, name) == getattr(plain, name)
+        ]  # fmt: skip
+        if names and now != plain:
+            back = ", ".join(f"{name} goes back to {getattr(plain, name):g}" for name in names)
+            lines.append(f"event at {event.time:g} s: {back}")
+        before = now
+    return lines
+
+
+def _slipped(scenario: Scenario, run: xr.Dataset) -> list[str]:
+    """Says for how long slip kept a learner of mrctl from learning, if that was more than half of the run."""
+    learns = scenario.learner not in ("none", *MODEL_BASED)
+    if not learns or "feedforward" in json.loads(run.attrs.get("stages", "{}")):
+        return []
+    drove = np.isfinite(run["x"].values)
+    slips = drove & ~(run["slip"].values <= MAX_LEARNING_SLIP)
+    if 2 * slips.sum() <= drove.sum():
+        return []
+    period = scenario.control_period
+    times = f"{period * slips.sum():.3g} of {period * drove.sum():.3g} s"
+    return [f"nothing was learned for {times}: slip above {MAX_LEARNING_SLIP:g}"]
 
 
 def _retuned(run: xr.Dataset) -> list[str]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.physics.bounds import compiling
-from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, PREFIX, REAR, RIGID, bottom, has, part
+from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, PREFIX, REAR, RIGID, UNPAIRED, bottom, has, part
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
 from mrctl.theory.kinematics import UP
@@ -58,7 +58,7 @@ def adopted(robot: RobotFile, world: Path) -> mujoco.MjSpec:
         InputError: A file is no MJCF, or a part of the robot is missing, ambiguous or impossible.
     """
     path = robot_path(robot)
-    with compiling(path):
+    with compiling(path, world):
         return _Adoption(robot, path).into(world)
 
 
@@ -84,6 +84,11 @@ class _Adoption:
         self.chassis = self._carrier(robot.chassis, wheels)
         self.ahead, self.left = self._directions(wheels, steered)
         places = {name: self._on_axle(name) for name in wheels}
+        between = places[wheels[1]] - places[wheels[0]]
+        if abs(between @ self.left) <= 0.5 * np.linalg.norm(between):
+            raise InputError(
+                f"wheels: the axes of the joints {_listed(wheels)} must point along the line through the two wheels"
+            )
         self.origin = np.mean([*places.values()], axis=0)
         self.wheels = sorted(wheels, key=lambda name: -float((places[name] - self.origin) @ self.left))
         self.steered = sorted(steered, key=self._side)
@@ -336,13 +341,18 @@ class _Adoption:
 
     def into(self, world: Path) -> mujoco.MjSpec:
         """Returns a world in which this robot replaces the world's own, ready to compile."""
-        spec = mujoco.MjSpec.from_file(str(world))
+        with compiling(world):
+            spec = mujoco.MjSpec.from_file(str(world))
         if (own := spec.body("chassis")) is None:
             raise InputError(f"world: {world} has no body 'chassis' that another robot could replace")
-        floors = [(p.geomname1, p.name, np.array(p.friction)) for p in spec.pairs if p.geomname2 == "wheel_left"]
-        pair = next(p for p in spec.pairs if p.geomname2 == "wheel_left")
-        solver = {n: np.array(getattr(pair, n)) for n in ("solref", "solreffriction", "solimp")}
-        ordinary = next(friction[0] for _, name, friction in floors if name == "tyre_left")
+        pairs = [p for p in spec.pairs if "wheel_left" in (p.geomname1, p.geomname2)]
+        if not pairs:
+            raise InputError(f"{world}: {UNPAIRED}")
+        floors = [
+            (p.geomname2 if p.geomname1 == "wheel_left" else p.geomname1, p.name, np.array(p.friction)) for p in pairs
+        ]
+        solver = {n: np.array(getattr(pairs[0], n)) for n in ("solref", "solreffriction", "solimp")}
+        ordinary = min(pairs, key=lambda p: p.name != "tyre_left").friction[0]  # the first where none has this name
         spec.delete(own)
         for numeric in list(spec.numerics):
             spec.delete(numeric)

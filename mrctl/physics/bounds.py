@@ -47,6 +47,9 @@ MAX_ATTRIBUTES: dict[str, float] = {
 }  # fmt: skip
 """Largest values of the attributes that alone, in any element, determine what MuJoCo allocates."""
 
+NAMES = "name", "class", "childclass", "model", "prefix"
+"""Attributes that may have any word as their value."""
+
 MAX_VERTICES = 22_500  # of a built-in mesh, such as a supersphere of 150 by 150; 1 s
 MAX_EDGES = 1_000  # of a built-in cone, for whose hull the time grows with their square
 MAX_LENGTHRANGE_STEPS = 1e4  # of the simulation that finds the length range of an actuator; by default 1,000
@@ -55,11 +58,11 @@ SUFFIXES = {suffix: 1024.0**power for power, suffix in enumerate("KMGTPE", start
 
 
 @contextlib.contextmanager
-def compiling(path: str | Path) -> Iterator[None]:
+def compiling(path: str | Path, *others: str | Path) -> Iterator[None]:
     """Turns what MuJoCo raises on a model that it cannot compile into one line that names the file.
 
-    Besides `ValueError` these are `MemoryError`, and `RuntimeError` or MuJoCo's `FatalError` where a library under it
-    fails. Errors of Python, which are others, pass.
+    A line that names one of the other files stays as it is. Besides `ValueError` these are `MemoryError`, and
+    `RuntimeError` or MuJoCo's `FatalError` where a library under it fails. Errors of Python, which are others, pass.
 
     Raises:
         InputError: MuJoCo cannot compile the model.
@@ -70,7 +73,8 @@ def compiling(path: str | Path) -> Iterator[None]:
         if not isinstance(error, (ValueError, MemoryError, RuntimeError)) and type(error).__name__ != "FatalError":
             raise
         text = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
+        named = text.startswith(tuple(f"{file}: " for file in (path, *others)))
+        raise InputError(text if named else f"{path}: {text}") from None
 
 
 def check_bounds(path: Path) -> None:
@@ -210,6 +214,7 @@ class _File:
             raise InputError(
                 f"{file}: <{tag}> makes {written + made:,.0f} elements; at most {MAX_GENERATED_ELEMENTS:,}"
             )
+        _check_finite(element, file)
         if tag in ("body", "frame") and "name" in element.attrib:
             self.named[element.attrib["name"]] = written + made
         return written, made
@@ -228,6 +233,15 @@ class _File:
         if element.tag == "attach":
             return self.named.get(element.get("body", element.get("frame", "")), self.total)
         return 0.0
+
+
+def _check_finite(element: ElementTree.Element, file: Path) -> None:
+    """Refuses NaN, in whose place MuJoCo takes its default, and infinity, which only a range may have."""
+    for name, value in element.items():
+        words = {word.lower().lstrip("+-") for word in value.split()} & {"nan", "inf", "infinity"}
+        if name not in NAMES and element.tag != "text" and (words if not name.endswith("range") else words & {"nan"}):
+            whose = f"{element.tag} {element.get('name', '')}".strip()
+            raise InputError(f"{file}: <{whose}> {name}: {value!r} is not finite")
 
 
 def _requests(element: ElementTree.Element, file: Path) -> Iterator[tuple[str, float, float]]:

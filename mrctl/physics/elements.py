@@ -34,6 +34,9 @@ PREFIX = "robot/"
 RIGID = "servo_steering"
 """Name of the text element in an adopted model whose steered wheels are held by servos."""
 
+UNPAIRED = "no contact pair between the wheels and a floor"
+"""What is wrong with a world in which the robot would sink."""
+
 
 def has(model: mujoco.MjModel, kind: str, name: str) -> bool:
     """Tells whether a model has an element of this kind (`body`, `joint`, `geom`, …) and name."""
@@ -123,6 +126,14 @@ def left_tyre_pairs(model: mujoco.MjModel) -> list[int]:
     wheel = model.geom("wheel_left").id
     pairs = [p for p in range(model.npair) if wheel in (model.pair_geom1[p], model.pair_geom2[p])]
     return sorted(pairs, key=lambda p: model.pair(p).name != "tyre_left")
+
+
+def driven_through(model: mujoco.MjModel) -> list[str]:
+    """Names the geoms of the world that could collide but have no contact pair with the rear left wheel."""
+    wheel = model.geom("wheel_left").id
+    paired = {int(g) for p in left_tyre_pairs(model) for g in (model.pair_geom1[p], model.pair_geom2[p])} - {wheel}
+    own = np.flatnonzero((model.geom_bodyid == 0) & ((model.geom_contype | model.geom_conaffinity) != 0))
+    return [part(model, int(g)) for g in own if g not in paired]
 
 
 def is_level(model: mujoco.MjModel) -> bool:

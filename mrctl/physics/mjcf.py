@@ -25,7 +25,7 @@ import numpy as np
 from mrctl.physics import adopt
 from mrctl.physics import obstacles as walls
 from mrctl.physics.bounds import compiling
-from mrctl.physics.elements import MOTORS, NUMERICS, RIGID, fronts, has, left_tyre_pairs
+from mrctl.physics.elements import MOTORS, NUMERICS, RIGID, UNPAIRED, driven_through, fronts, has, left_tyre_pairs
 from mrctl.physics.files import is_shipped, robot_path, shipped_digest, world_path
 from mrctl.physics.hull import footprint
 from mrctl.physics.parameters import load_torques, read_robot
@@ -112,10 +112,14 @@ def _compiled(world: str, steering: Steering | None, robot: RobotFile, obstacles
     path = world_path(world)
     source = path if robot == CAR else robot_path(robot)
     # A robot that is refused gets one line, without warnings.
-    with compiling(source), warnings.catch_warnings(record=True) as held:
+    with compiling(source, path), warnings.catch_warnings(record=True) as held:
         spec = _assembled(path, robot)
         model = spec.compile()
         nominal = _arranged(model, steering, robot)
+        if geoms := driven_through(model):
+            how = 'give each wheel one, or the geom contype="0" conaffinity="0"'
+            text = f"{path}: the wheels pass through {', '.join(geoms)}, which has no contact pair with them; {how}"
+            warnings.warn(text, stacklevel=1)
         if obstacles.shapes:
             spec = _assembled(path, robot)
             walls.add(spec, obstacles, footprint(model), idle)
@@ -166,12 +170,18 @@ def _in_place_of_car(world: Path, path: Path, own: mujoco.MjSpec) -> mujoco.MjSp
 
     MuJoCo would look beside the world for the files that the robot's file includes, and for its meshes and images.
     """
-    texts, left = {f"{CAR.path}.xml": path.read_bytes()}, [path]
-    while left:
-        for name in re.findall(r'<include\s+file="([^"]+)"', left.pop().read_text("utf-8", "replace")):
-            if (file := path.parent / name).is_file():
-                texts[name] = file.read_bytes()
-                left.append(file)
+    texts, files = {}, [path]
+
+    def renamed(include: re.Match) -> str:
+        """Gives an included file a name of its own: MuJoCo drops folders, and one of them may be called car.xml."""
+        if not (file := path.parent / include[2]).is_file():
+            return include[0]
+        files.append(file)
+        return f"{include[1]}included_{len(files)}.xml"
+
+    for number, file in enumerate(files, start=1):  # which grows meanwhile
+        text = re.sub(r'(<include\s+file=")([^"]+)', renamed, file.read_text("utf-8", "replace"))
+        texts[f"{CAR.path}.xml" if file == path else f"included_{number}.xml"] = text.encode()
     spec = mujoco.MjSpec.from_file(str(world), include=texts)
     assets = (("mesh", own.meshes, own.meshdir), ("texture", own.textures, own.texturedir))
     for kind, asset, folder in ((kind, asset, folder) for kind, found, folder in assets for asset in found):
@@ -322,7 +332,7 @@ def _check_elements(model: mujoco.MjModel, steering: Steering) -> None:
     if required and model.actuator_ctrlnum[model.actuator("steering").id] != 2:
         raise InputError("actuator steering must be a <pid> with position and velocity inputs")
     if not left_tyre_pairs(model):
-        raise InputError("no contact pair between the wheels and a floor")
+        raise InputError(UNPAIRED)
 
 
 def _check_motor(model: mujoco.MjModel, name: str) -> None:

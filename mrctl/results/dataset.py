@@ -158,6 +158,12 @@ def written_by(result: xr.Dataset) -> str:
     return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
 
 
+JOINED = (
+    "run: two different runs have one number, as results of different simulate calls have; these cannot be joined; use "
+    "plots.compare_errors(a, b), drive all scenarios in one call of simulate, or sweep over the axis controller"
+)
+"""What is wrong with a result after xr.concat, which keeps the scenarios of one result alone."""
+
 NEEDED_ATTRIBUTES = {"scenarios", "versions", "control_period"}
 """Attributes of a result that can be saved."""
 
@@ -276,10 +282,7 @@ def held_scenarios(result: xr.Dataset) -> list[dict[str, Any]]:
         if foreign := set(numbers) - set(range(len(every))):
             raise InputError(f"run: {min(foreign)} is the number of none of the {len(every)} scenarios in the result")
         if not unique_runs(result):
-            raise InputError(
-                "run: two different runs have one number, as after xr.concat, which keeps the scenarios of one result "
-                "alone; simulate drives all scenarios in one call"
-            )
+            raise InputError(JOINED)
         return [every[run] for run in numbers]
     if len(every) != result.sizes.get("run", 1):
         raise InputError("run: the selection has lost the number of its run; select it without drop=True")
@@ -301,8 +304,8 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     """Writes a result as a zarr store, whole or not at all.
 
     Raises:
-        InputError: The dataset, such as an opened sweep, is none that `open` could read, or the path exists, cannot be
-            written, or is that of a file in another format.
+        InputError: The dataset, such as an opened sweep or results that were joined, is none that `open` could read, or
+            the path exists, cannot be written, or is that of a file in another format.
     """
     check_kind(result)
     if missing := NEEDED_ATTRIBUTES - set(result.attrs):
@@ -310,6 +313,8 @@ def save(result: xr.Dataset, path: str | Path) -> None:
             f"result: lacks the attribute {min(missing)}, without which mrctl could not open it; result.to_zarr(path) "
             "writes any dataset"
         )
+    if not unique_runs(result):
+        raise InputError(JOINED)
     from zarr.codecs import Crc32cCodec, ZstdCodec  # imported here because a run that saves nothing needs no zarr
 
     path = Path(path)

@@ -118,7 +118,10 @@ def export(
         raise InputError(f"to: {to!r} is not {', '.join(get_args(Format))}")
     out = Path(out)
     if not {"x", "time"} <= set(result.variables):
-        raise InputError("result: holds metrics only; mrctl run STORE --run K --out DIR makes the signals of one run")
+        raise InputError(
+            "result: holds metrics only, which are in the table STORE/runs.parquet, for pandas.read_parquet; mrctl run "
+            "STORE --run K --out DIR makes the signals of one run"
+        )
     whole = as_runs(result)
     numbers, counts = np.unique(whole["run"].values, return_counts=True)
     if (counts > 1).any():

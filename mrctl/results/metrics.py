@@ -423,8 +423,8 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     Returns:
         Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time, `METRICS` in that lap,
         and laps_to_converge, the first lap from which on the position error stays within 1.2 times its final value; for
-        what `simulate` returns also those of `dataset.FAULTS` that a run has. `attrs["failed"]` is the number of failed
-        runs, `attrs["units"]` the units by column.
+        what `simulate` returns also failure, which says why a run failed, and those of `dataset.FAULTS` that a run has.
+        `attrs["failed"]` is the number of failed runs, `attrs["units"]` the units by column.
 
     Raises:
         InputError: There is no run, or none has that lap.
@@ -443,6 +443,7 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     rows = np.arange(len(counts))
     columns = {name: laps[name].values for name in PER_RUN[:-1] if name in laps.coords}
     columns |= {name: laps[name].values for name in ("laps", "failed", "failure_time")}
+    columns |= {"failure": np.atleast_1d(result["failure"].values)} if "failure" in result else {}
     columns |= {name: np.where(there, laps[name].values[rows, np.where(there, index, 0)], np.nan) for name in METRICS}
     columns["laps_to_converge"] = laps_to_converge(laps, "position_rmse").values
     faults = {name: np.atleast_1d(result[name].values) for name in FAULTS if name in result}

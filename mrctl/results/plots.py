@@ -35,6 +35,11 @@ from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap, sho
 from mrctl.theory.obstacles import Obstacles, turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 
+__all__ = [
+    "compare_errors", "distributions", "errors", "excitation", "feedforward_outputs", "inverse_dynamics",
+    "laps_by_case", "learning_curve", "path", "save", "velocities", "voltages",
+]  # fmt: skip
+
 COLUMN_WIDTH, PAGE_WIDTH = 88 / 25.4, 180 / 25.4  # inches
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
 REFERENCE: dict[str, Any] = {"color": "0.25", "lw": 0.8, "ls": (0, (4, 2)), "zorder": 3}
@@ -77,6 +82,11 @@ ERRORS = {
 MILLI = 1e3  # errors are drawn in thousandths of the units in a result
 
 P = ParamSpec("P")
+
+
+def __dir__() -> list[str]:
+    """Lists the figures alone, for who explores `mrctl.plots`."""
+    return __all__
 
 
 class Curve(NamedTuple):

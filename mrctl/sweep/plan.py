@@ -43,6 +43,11 @@ FILE_FIELDS = "learned", "fel.weights"  # fields of the scenario with the name o
 class Sweep(Record):
     """Many runs: a base scenario, and the axes along which it varies."""
 
+    foreign = dict.fromkeys(
+        (name for name in Scenario.model_fields if name != "seed"),
+        "is a field of a scenario, which `mrctl run FILE` drives; a sweep has its fields in base",
+    )
+
     base: Scenario = Scenario()
     """Scenario that the runs have in common; each run has a seed drawn for it, of 2³² ones, unless `seed`
     is an axis."""

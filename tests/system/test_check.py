@@ -382,7 +382,9 @@ def test_a_warning_is_said_once(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     assert main(["check", "b1.xml"]) == 0
     (said,) = messages(capfd.readouterr().err)
-    assert said.startswith("mrctl: Attach conflict") and [file.name for file in tmp_path.iterdir()] == ["b1.xml"]
+    assert said.startswith("mrctl: warning: Attach conflict") and [file.name for file in tmp_path.iterdir()] == [
+        "b1.xml"
+    ]
     model = load("flat")
     data = mujoco.MjData(model)
     data.qacc_warmstart[:] = data.qvel[:] = 1e30

@@ -17,11 +17,13 @@ import pytest
 import mrctl
 from mrctl import cli
 from mrctl.control.fel import initial_weights
+from mrctl.experiments import single
 from mrctl.record import Record
 from mrctl.results.dataset import save
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 
+CIRCLE = mrctl.Circle(radius=0.5, period=5.0)
 SHORT = ["--laps", "1", "reference:circle", "--reference.radius", "0.5", "--reference.period", "5"]
 SCENARIO = """
 learner = "rls"
@@ -103,6 +105,29 @@ def test_event_after_the_arrival(tmp_path: Path, capsys: pytest.CaptureFixture) 
     (tmp_path / "run.toml").write_text(run.to_toml())
     assert cli.main(["run", str(tmp_path / "run.toml")]) == 0
     assert "event at 2.5 s: after the end of the run at 1." in capsys.readouterr().out
+
+
+def test_event_that_takes_back(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The report says what the perturbation of an event takes back, unless it takes back all on purpose."""
+    heavier = mrctl.Perturbation(mass_factor=1.2, slope=0.01)
+    changes = {"payload": 1.0, "slope": 0.01}, {"payload": 1.0, "slope": 0.02}, {}
+    events = tuple(
+        mrctl.Event(time=0.5 * (k + 1), perturbation=mrctl.Perturbation(**one)) for k, one in enumerate(changes)
+    )
+    run = mrctl.Scenario(learner="none", laps=1, reference=CIRCLE, perturbation=heavier, events=events)
+    (tmp_path / "run.toml").write_text(run.to_toml())
+    assert cli.main(["run", str(tmp_path / "run.toml")]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("event")]
+    assert said == ["event at 0.5 s: mass_factor goes back to 1"]
+
+
+@pytest.mark.parametrize(("learner", "says"), [("rls", True), ("indi", False), ("none", False)])
+def test_learning_that_slip_prevents(learner: Any, says: bool) -> None:
+    """The report of a learner says for how long slip kept it from learning, if that was most of the run."""
+    flat = mrctl.Perturbation(left_radius_factor=0.8)  # which looks like slip
+    run = mrctl.Scenario(prior="model", learner=learner, laps=1, reference=CIRCLE, perturbation=flat)
+    text = single.run(run, None, False).text
+    assert bool(re.search(r"^nothing was learned for \S+ of \S+ s: slip above 0\.1$", text, re.MULTILINE)) == says
 
 
 def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) -> None:
@@ -311,10 +336,16 @@ def test_bad_scenario_is_one_line(
         (["navigate", "doorway:1", "--perturbation.mas", "2"], "did you mean --perturbation.mass-factor?"),
         (["check", "--robot.path", "mule.xml"], "--robot.path: is no flag of mrctl check"),
         (["run", "reference:circle", "--laps", "1"], "--laps: is no flag of reference:circle, and those of mrctl run"),
-        (["navigate", "doorway:1", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
-        (["run", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
+        (["navigate", "doorway:1", "mule.xml"], "mule.xml: the file of a robot is given as --robot.path mule.xml"),
+        (["run", "mule.xml"], "mule.xml: the file of a robot is given as --robot.path mule.xml"),
         (["navigate", "doorway:1", "--sensing.lidar.nois", "3"], "did you mean --sensing.lidar.noise?"),
         (["run", "--lapz=3"], "no flag is called --lapz"),
+        (["run", "--pertubation", "all"], "no flag is called --pertubation; did you mean --perturbation?"),
+        (
+            ["navigate", "doorway:1", "--controller", "a.py:A"],
+            "controller: a mission of this command drives with those",
+        ),
+        (["view", "--controller=a.py:A"], "controller: a live session drives with those of mrctl; with your own, give"),
         (["run", "--out"], "out: needs a value; see mrctl run --help"),
         (["sweep"], "SWEEP.toml, --out PATH: missing; see mrctl sweep --help"),
         (["record", "run"], "--out PATH: missing; see mrctl record --help"),
@@ -483,6 +514,16 @@ def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     for flag in every.keys() - short.keys():
         name = flag.split()[0].rstrip(",")
         assert re.search(rf"^  {re.escape(re.sub(r'[.].*', '.*', name))} ", screen, re.MULTILINE), flag
+
+
+def test_defaults_of_navigate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """The help says that `--learner` alone takes the prior away, and the other way round."""
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        cli.main(["navigate", "--help"])
+    screen = " ".join(capsys.readouterr().out.split())
+    assert "(default: model, or none where --learner is given)" in screen
+    assert "(default: composite, or fel where --prior is given)" in screen
 
 
 def test_short_help_of_identify(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

@@ -222,7 +222,9 @@ def test_told():
     """A run says how often and why."""
     fast = of(LATE, "fel", Guard(), steering="rigid", laps=1, **FAST)
     text, *_ = single.run(fast, None, False)
-    assert "guard acted" in text and re.search(r"guard at \d\.\d\d s: fallback, velocity far from the command", text)
+    assert re.search(r"guard acted, times \|\n.*\n.* \| [1-9]\d* +\|", text) and re.search(
+        r"guard at \d\.\d\d s: fallback, velocity far from the command", text
+    )
     listed = json.loads(single.run(fast, None, True)[0])
     assert {"time", "action", "reason"} == set(listed["guard"][0])
     assert listed["laps"][0]["guard_actions"] == sum(event["action"] != "resume" for event in listed["guard"])

@@ -96,6 +96,9 @@ def test_refused(files, tmp_path):
         Simulation([BASE.model_copy(update=FEEDFORWARDS["model+indi"] | {"learned": "x.safetensors"})])
     with pytest.raises(InputError, match=r"^learned: .*fel\.safetensors was learned by fel, not by rls$"):
         Simulation([BASE.model_copy(update={"learner": "rls", "learned": files["fel"][0]})])
+    (tmp_path / "learned.safetensors").touch()
+    with pytest.raises(InputError, match=r"^learned: .* is a folder; give .*/learned\.safetensors$"):
+        Simulation([BASE.replace(learned=tmp_path)])
     other = BASE.replace(robot="racecar", reference=Circle(radius=1.5, period=8.0), learned=files["fel"][0])
     with pytest.warns(UserWarning, match=r"fel\.safetensors was learned on the robot car, not on racecar$"):
         Simulation([other])

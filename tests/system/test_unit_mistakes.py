@@ -151,7 +151,7 @@ def test_an_impossible_robot_drives_with_a_warning(
     assert len(examined) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and said.startswith(
-        f"mrctl: {file}: impossible number: mass over the cube of the size"
+        f"mrctl: warning: {file}: impossible number: mass over the cube of the size"
     )
     assert said.endswith(f"; see mrctl check {file}\n")
 

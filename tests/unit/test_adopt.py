@@ -328,6 +328,16 @@ def test_copy_with_files_of_its_own(tmp_path, world):
     assert model.nmesh == 1 and read_robot(model) == read_robot(mjcf.load(world))
 
 
+def test_file_that_includes_the_default_robot(tmp_path):
+    """What a file adds to a file called car.xml that it includes is there, and so is what that one has."""
+    (tmp_path / "car.xml").write_text((models_folder() / "car.xml").read_text().replace('mass="17.2"', 'mass="27.2"'))
+    bigger = '<mujoco><include file="{}"/><custom><numeric name="mine" data="1"/></custom></mujoco>'
+    for name in ("car.xml", tmp_path / "car.xml"):
+        (tmp_path / "mine.xml").write_text(bigger.format(name))
+        model, robot = mjcf.build(robot=mrctl.load_robot(tmp_path / "mine.xml"))
+        assert has(model, "numeric", "mine") and robot.mass == pytest.approx(mjcf.build()[1].mass + 10)
+
+
 @pytest.mark.parametrize(("name", "steering"), [("turtlebot", "caster"), ("racecar", "rigid"), ("car", "compliant")])
 def test_robot_brings_its_steering(name, steering):
     """A scenario that names a robot and no steering drives with that robot's, and its result says which."""
@@ -492,6 +502,7 @@ PLAIN = '<velocity name="drive" joint="a"/>' + MOTOR.format("b", 30, "")
 WARM = 'inductance="1e-4 0" thermal="1 10 20 20 0.004 0.1"'
 TRIPLE = MOTORS + MOTOR.format("c", 30, "")
 ERRORS = {
+    "axes across": (document(DIFF.replace("0 1 0", "1 0 0"), MOTORS), {}, ("'a', 'b' must point along",)),
     "no motors": (document(DIFF, ""), {}, ("wheels", "dcmotor", "'a', 'b'")),
     "three motors": (document(TRICYCLE, TRIPLE + SERVO.format("s1")), {}, ("wheels", "3 joints")),
     "another motor": (document(DIFF, PLAIN), {"wheels": ("a", "b")}, ("motor", "'a'", "'drive'", "<dcmotor joint=")),

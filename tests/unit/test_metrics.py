@@ -238,7 +238,9 @@ def test_summary_counts_failures():
     result = fail(make(runs=3, v=np.array([[1.0], [2.0], [3.0]])), 2, 3.0)
     table = metrics.summary(result)
     assert len(table) == 3 and table.attrs["failed"] == 1 and table["failed"].tolist() == [False, False, True]
-    assert table.attrs["units"]["energy"] == "J"
+    assert table.attrs["units"]["energy"] == "J" and "failure" not in table
+    why = metrics.summary(result.assign(failure=("run", ["", "", "tilt over 30°"])))["failure"]
+    assert why.tolist() == ["", "", "tilt over 30°"]
     assert metrics.summary(result, lap=1)["v_rmse"].tolist() == [1, 2, 3]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Scenario, per_lap, simulate
+from mrctl.checks.command import examination
 from mrctl.physics import files, mjcf
 from mrctl.physics.files import SHIPPED, models_folder
 from mrctl.physics.parameters import read_robot
@@ -261,3 +262,26 @@ def test_no_pair(folder):
     text = (folder / "flat.xml").read_text()
     (folder / "flat.xml").write_text(text[: text.index("<contact>")] + "</mujoco>")
     refuses(str(folder / "flat.xml"), "pair")
+    line = f"^{folder / 'flat.xml'}: no contact pair between the wheels and a floor$"
+    with pytest.raises(InputError, match=line):
+        mjcf.load(str(folder / "flat.xml"), robot=RobotFile(path="turtlebot"))
+    with pytest.raises(InputError, match=line):
+        examination(str(folder / "flat.xml"))
+
+
+def test_floor_without_pairs(folder):
+    """A geom of a world that the wheels pass through is named, unless it is decoration; pairs are found either way."""
+    text = (folder / "flat.xml").read_text()
+    bump = '<geom name="bump" type="box" size="0.3 0.3 0.005"/>'
+    look = bump.replace("bump", "look").replace("/>", ' contype="0" conaffinity="0"/>')
+    (folder / "flat.xml").write_text(text.replace("<worldbody>", f"<worldbody>{bump}{look}"))
+    for robot in (RobotFile(), RobotFile(path="turtlebot")):
+        with pytest.warns(UserWarning, match="the wheels pass through bump, which has no contact pair") as said:
+            mjcf.load(str(folder / "flat.xml"), robot=robot)
+        assert len(said) == 1
+    world = folder / "flat.xml"
+    world.write_text(
+        text.replace('name="tyre_left" geom1="floor" geom2="wheel_left"', 'geom1="wheel_left" geom2="floor"')
+    )
+    turtlebot = [mjcf.load(path, robot=RobotFile(path="turtlebot")) for path in ("flat", str(world))]
+    assert np.array_equal(*(model.pair_friction for model in turtlebot))

@@ -142,6 +142,11 @@ def test_plant_is_named():
     assert alone.legends[0].get_title().get_text() == "plant: b, perturbed, lab"
 
 
+def test_names():
+    """Who explores the module finds the figures, and all of them."""
+    assert set(dir(plots)) == set(plots.__all__) >= {*ALL}
+
+
 def test_path():
     """The path of each run and the reference, once, with equal axes and the start marked."""
     result = make()

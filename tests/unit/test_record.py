@@ -275,7 +275,28 @@ def test_paths():
             {"reference": {"kind": "circle", "perod": 3}},
             "reference.circle.perod: there is no such field; did you mean period?",
         ),
-        ({"reference": "circle"}, "reference: must be a record, or a table of its fields"),
+        (
+            {"reference": "circle"},
+            'reference: must be a record, or a table of its fields, such as { kind = "circle" }',
+        ),
+        (
+            {"obstacles": {"shapes": [3]}},
+            'obstacles.shapes.0: must be a record, or a table of its fields, such as { kind = "disc" }',
+        ),
+        (
+            {"runs": 3, "axes": []},
+            "axes: is a field of a sweep, which `mrctl sweep FILE --out FOLDER` computes",
+        ),
+        (
+            {"shapes": []},
+            "shapes: is a field of obstacles; `mrctl navigate FILE --goal X,Y,θ` drives among them, and "
+            'obstacles = "FILE" in a scenario names them',
+        ),
+        (
+            {"controller": "a.py:A"},
+            "controller: a scenario names no controller of your own; `mrctl run FILE --controller NAME.py:NAME` drives "
+            "with one, and a sweep has a field controller",
+        ),
         ({"robot": 3}, "robot: must be a record, or a table of its fields, or its path"),
         ({"events": Event(time=1, learning=False)}, "events: must be a list of records (and 7 more)"),
         ({"events": [{"time": 1.0, "push": [20.0, 0.0]}]}, "events.0.push: has 2 values, which are too few"),

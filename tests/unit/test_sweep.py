@@ -245,6 +245,7 @@ def grid(start, stop, count):
         ("axes.0.values: .* at least 1", [axis("laps", values=[])], {}),
         ("axes.0.stdev: there is no such field", [{**MASS, "stdev": 1}], {}),
         ("every: only where record", [], {"every": 5}),
+        ("laps: is a field of a scenario, which `mrctl run FILE` drives", [], {"laps": 5}),
         ("runs: .* at most 100,000,000", [axis("laps", grid=grid(1, 10000, 10000))], {"runs": 99999999}),
         (
             "control_period: signals share",
