@@ -129,7 +129,7 @@ class Scenario(Record):
     reference: Reference = Lemniscate()
     """The robot follows this reference trajectory."""
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
-    """Number of laps."""
+    """Laps to drive."""
     prior: PriorName = "none"
     """Model that the feedforward starts from; `true_model` has the true constants, for reference."""
     learner: LearnerName = "fel"

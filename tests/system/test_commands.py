@@ -544,7 +544,7 @@ def test_short_help_has_the_defaults_of_the_file(capsys: pytest.CaptureFixture, 
     with pytest.raises(SystemExit):
         cli.main(["run", str(scenario), "--help"])
     out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "(default: rls)" in out and "Number of laps. At least 1, at most 10000. (default: 1)" in out
+    assert "(default: rls)" in out and "Laps to drive. At least 1, at most 10000. (default: 1)" in out
 
 
 def test_version(capsys: pytest.CaptureFixture) -> None:
