@@ -193,7 +193,7 @@ def test_names_the_unit_where_no_limits_are_declared(
     assert re.search(f"- wrong unit: .*{re.escape(said)}", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("mistake", ["gear of 1", "mass in grams", "friction"])
 def test_ends_in_time(
     mistake: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
