@@ -47,8 +47,8 @@ for avoid, localisation in (("window", "scan"), ("mppi", "particles")):
 """
 
 # The same examples for everyone, no deadline (shared machines stall); `--hypothesis-profile=explore` looks further.
-settings.register_profile("mrctl", deadline=None, derandomize=True)
-settings.register_profile("explore", deadline=None, print_blob=True)
+settings.register_profile("mrctl", deadline=None, derandomize=True, max_examples=50)
+settings.register_profile("explore", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("mrctl")
 
 

@@ -499,10 +499,16 @@ def open_result(path: str | Path) -> xr.Dataset:
         raise InputError(f"{path}: not a saved result, nor a sweep's store: no zarr.json")
     stored = only_files(Path(path))
     arrays: dict[Path, zarr.Array] = {}
-    for folder in sorted(file.parent for file in Path(path).glob("*/zarr.json")):
+    folders = sorted(file.parent for file in Path(path).glob("*/zarr.json"))
+    for folder in folders:
         check_codecs(folder)
-        with reading(folder):
-            arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
+    with contextlib.suppress(InputError), reading_chunks(path):  # all at once is faster; what is damaged is named below
+        found = zarr.open_group(path, mode="r", zarr_format=3).arrays()
+        arrays = {Path(path) / name: array for name, array in found}
+    for folder in folders:
+        if folder not in arrays:
+            with reading(folder):
+                arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
     check_declared(Path(path), sum(array.nbytes for array in arrays.values()), stored)
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
@@ -512,7 +518,8 @@ def open_result(path: str | Path) -> xr.Dataset:
         raise InputError(f"{Path(path) / min(gone)}: missing")
     for folder, array in arrays.items():
         whole = {VARIABLE_NAMES, ALL_CHUNKS_BEFORE_0_10_2} & set(result.attrs)
-        if whole and (lost := array.nchunks - array.nchunks_initialized):
+        keys = map(array.metadata.encode_chunk_key, np.ndindex(array.cdata_shape) if whole else ())
+        if lost := sum(not (folder / key).is_file() for key in keys):
             raise InputError(f"{folder}: {lost} chunks are missing")
     for name in result.variables:
         with reading_chunks(f"{path}/{name}"):

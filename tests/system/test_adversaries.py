@@ -27,6 +27,7 @@ from mrctl.control.rejection import LinearLoop, rejection
 from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation
 from mrctl.physics import mjcf
+from mrctl.sensing.tiers import TIERS
 
 PERIOD = 0.01
 ARRANGEMENTS = "compliant", "caster", "rigid"
@@ -181,14 +182,16 @@ LEARNERS = [name for name, pair in FEEDFORWARDS.items() if pair["learner"] in ("
 BENIGN = "nominal", "all", "payload aside", "slope 10°", "mass +50 %", "supply -20 %", "drive friction x3"
 
 
-def benign(tiers, names, draws, laps):
-    """Returns the share of benign runs in which the guard acts, and the largest rise of a case's median error."""
-    cases = list(product(ARRANGEMENTS, tiers, names, LEARNERS))
+def benign(cases, draws, laps, **changes):
+    """Returns the share of benign runs in which the guard acts, and the largest rise of a case's median error.
+
+    A case is an arrangement, a tier, the name of a perturbation and a learner.
+    """
 
     def runs(cases, on):
         return simulate([
             scenario(steering, tier, draw, laps=laps, guard=Guard(on=on), perturbation=PERTURBATIONS[name],
-                     **FEEDFORWARDS[learner])
+                     **FEEDFORWARDS[learner], **changes)
             for steering, tier, name, learner in cases for draw in draws
         ])  # fmt: skip
 
@@ -207,15 +210,20 @@ def benign(tiers, names, draws, laps):
 
 
 def test_benign():
-    """Learners in order, with little and much noise: the guard does nothing."""
-    assert benign(("ideal", "lab", "field"), ("nominal", "all"), (0,), 1) == (0.0, 0.0)
+    """Learners in order, with little and much noise: the guard does nothing.
+
+    Each learner has either perturbation in half of the arrangements and tiers, and in all of them with the mark `full`.
+    """
+    each = product(enumerate(ARRANGEMENTS), enumerate(TIERS), enumerate(LEARNERS))
+    cases = [(steering, tier, BENIGN[(i + j + k) % 2], learner) for (i, steering), (j, tier), (k, learner) in each]
+    assert benign(cases, (0,), 1, physics_step=0.005) == (0.0, 0.0)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("tier", ["ideal", "lab", "field"])
+@pytest.mark.parametrize("tier", TIERS)
 def test_much_benign(tier):
     """It acts in at most 1 % of the runs, and raises no case's median by more than 1 %."""
-    acted, rise = benign((tier,), BENIGN, range(5), 4)
+    acted, rise = benign(list(product(ARRANGEMENTS, (tier,), BENIGN, LEARNERS)), range(5), 4)
     print(tier, "acted in", acted, "largest rise", rise)
     assert acted <= 0.01 and rise <= 0.01
 

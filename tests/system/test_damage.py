@@ -176,10 +176,9 @@ def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> 
     np.testing.assert_array_equal(found["x"][[1, 0]], undamaged["x"].values[[1, 0]])
     with pytest.raises(InputError, match="signals/c/1/0/0: damaged"):
         found.load()
-    command = [sys.executable, "-m", "mrctl", "run", str(tmp_path / "store"), "--run", "2"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    said = [line for line in done.stderr.splitlines() if "compiling the laws" not in line]
-    assert done.returncode == 2 and len(said) == 1, done.stderr  # zarr's other readers say nothing
+    command = [sys.executable, "-m", "mrctl", "export", str(tmp_path / "store"), "--to", "csv", "--out", "x.csv"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr  # zarr's other readers say nothing
 
 
 def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:

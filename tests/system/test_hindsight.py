@@ -1,6 +1,7 @@
 """The best fixed feedforward in hindsight, against the true inverse dynamics and other feedforwards."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,14 +29,22 @@ from mrctl.results.metrics import over_laps
 from mrctl.sweep import jobs
 from mrctl.sweep.store import Store
 
+pytestmark = pytest.mark.xdist_group("hindsight")  # what its tests share is made once
+
 IDEAL = Sensing(tier="ideal")
 BASE = Scenario(sensing=IDEAL, reference=Lemniscate(period=12), laps=2, perturbation=PERTURBATIONS["all"])
+
+
+@cache
+def first(*group: Scenario) -> tuple[xr.Dataset, np.ndarray]:
+    """The first drive of a group, which several tests share: that of `simulate`."""
+    return drive(group, None)
 
 
 def test_finds_the_true_inverse_dynamics():
     """Along the lap its voltage is that of the robot as it is, of which it was told nothing, to 2 % of the swing."""
     group = [BASE.model_copy(update=FEEDFORWARDS["model"])]
-    _, found = drive(group, drive(group, None)[1])
+    _, found = drive(group, first(*group)[1])
     truth = Simulation([BASE.model_copy(update=FEEDFORWARDS["true_model"])]).hierarchy.prior.rows
     _, twist, acceleration = BASE.reference.sample(np.linspace(0, 12, 400))
     x = feature_matrix(twist, acceleration, truth["half_track"], np.ones((1, 8)))
@@ -46,7 +55,7 @@ def test_finds_the_true_inverse_dynamics():
 def test_nothing_left_to_explain():
     """Driven again, the feedback is uncorrelated with the features: another repetition changes hardly a voltage."""
     group = [BASE.model_copy(update=FEEDFORWARDS["model"])]
-    once = drive(group, None)[1]
+    once = first(*group)[1]
     twice = drive(group, once)[1]
     again = drive(group, twice)[1]
     x = feature_matrix(*BASE.reference.sample(np.linspace(0, 12, 400))[1:], np.array([0.188]), np.ones((1, 8)))
@@ -71,7 +80,7 @@ def test_fit(steering):
     for reference in (BASE.reference, Circle(radius=1.0, period=8.0)):
         group = [BASE.model_copy(update={"steering": steering, "reference": reference} | FEEDFORWARDS["model"])]
         true = [s.model_copy(update=FEEDFORWARDS["true_model"]) for s in group]
-        drives = twice_fitted(group), simulate(group), simulate(true)
+        drives = twice_fitted(group), first(*group)[0], simulate(true)
         fitted, model, known = (per_lap(one).isel(lap=1) for one in drives)
         for other in (model, known):
             assert (fitted.feedback_share.values < other.feedback_share.values).all()
@@ -93,7 +102,8 @@ def test_best_of_its_drives(monkeypatch):
         patch.setattr("mrctl.loop.hindsight.drive", lambda *given: made.append(drive(*given)) or made[-1])
         chosen = best_fixed(runs)
     assert len(made) == 1 + REPETITIONS == 3
-    drives = chosen, simulate(runs), made[-1][0]
+    drives = chosen, made[0][0], made[-1][0]
+    assert np.array_equal(made[0][0].x, simulate(runs).x)
     best, model, fitted = (over_laps(per_lap(one), "position_rmse").values for one in drives)
     assert (model < 0.8 * fitted).tolist() == [True, True, False]
     assert (fitted < model).tolist() == [False, False, True]
@@ -104,4 +114,4 @@ def test_best_of_its_drives(monkeypatch):
 
 def twice_fitted(group: list[Scenario]) -> xr.Dataset:
     """Returns the last of the drives that `best_fixed` chooses from."""
-    return drive(group, drive(group, drive(group, None)[1])[1])[0]
+    return drive(group, drive(group, first(*group)[1])[1])[0]

@@ -145,15 +145,23 @@ INCLINES = {
 """Voltage that a learner has for the cosine and the sine of the heading."""
 
 
+SLOPE = Scenario(laps=8, prior="model", perturbation=Perturbation(slope=0.1), initial_spread=(0, 0, 0))
+
+
+@pytest.fixture(scope="module")
+def sloping():
+    """The model alone on the slope."""
+    return simulate([SLOPE.replace(learner="none")])
+
+
 @pytest.mark.parametrize("learner", INCLINES)
-def test_slope(learner):
+def test_slope(learner, sloping):
     """On a slope it finds gravity along the robot, and the errors fall below those of the model, which has no slope.
 
     The lemniscate begins at 45°, from which the heading of a learner counts: the voltage of gravity at an angle θ
     from there is M g sin α r/(2 K_m) cos(θ + 45°), with the stall torque K_m of a drive per volt.
     """
-    base = Scenario(laps=8, prior="model", perturbation=Perturbation(slope=0.1), initial_spread=(0, 0, 0))
-    simulation = Simulation([base.replace(learner=learner)])
+    simulation = Simulation([SLOPE.replace(learner=learner)])
     while simulation.running:
         simulation.step()
     robot, found = simulation.plant.robot, INCLINES[learner](simulation.hierarchy.learner)
@@ -161,7 +169,7 @@ def test_slope(learner):
     np.testing.assert_allclose(found, gravity * np.sqrt(0.5) * np.array([1, -1]), rtol=0.1)
     learning, without = (
         per_lap(run)[["v_rmse", "position_rmse"]].isel(run=0, lap=-1).to_array().values
-        for run in (simulation.result(), simulate([base.replace(learner="none")]))
+        for run in (simulation.result(), sloping)
     )
     assert (learning < np.multiply([0.8, 0.9], without)).all(), (learning, without)
 

@@ -64,6 +64,7 @@ ELSEWHERE = {
     r"mrctl tune racecar .*": (
         "tests/system/test_commands.py::test_tune_designs", "mrctl.experiments.tuning.tune",
     ),
+    r"mrctl tune": ("tests/system/test_response.py::test_designed_is_measured", "mrctl.experiments.tuning.tune"),
     r"mrctl tune --search .*": ("tests/system/test_search.py::test_command", "mrctl.experiments.search.search"),
     r"mrctl bench": ("tests/benchmarks/test_bench.py::test_command", "mrctl.experiments.bench.run"),
     r"mrctl view( --(?!export)\S+( \w+)*)*": (

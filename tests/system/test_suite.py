@@ -7,7 +7,7 @@ import re
 import shutil
 import signal
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from PIL import Image
 from scipy import stats
@@ -82,13 +83,24 @@ def tiny(mode: str, seeds: int, random: int, course: mrctl.Circle = COURSE) -> l
     return [*fixed, *([Case("random", "random", tuple(drawn))] if random else [])]
 
 
+def as_png(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Writes a figure without the PDF, which takes as long; test_plots.py looks at both."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.png", dpi=plots.STYLE["savefig.dpi"])
+    return [folder / f"{name}.png"] * 2
+
+
 @pytest.fixture(autouse=True, scope="module")
 def small(here_throughout: None) -> Iterator[None]:
     """Few short runs in this process, small figures, and neither PID nor machine measured again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(suite, "cases", tiny)
-        patch.setattr(suite, "pace", cache(suite.pace))
+        with pytest.MonkeyPatch.context() as few:
+            few.setattr(suite, "RUNS_PER_JOB", 2)
+            pace = suite.pace()
+        patch.setattr(suite, "pace", lambda: pace)
         patch.setitem(plots.STYLE, "savefig.dpi", 60)
+        patch.setattr(plots, "save", as_png)
         patch.setattr(tuning, "design", lambda *_: {})
         patch.setattr(tuning, "statement", lambda _: "phase margin 88 degrees")
         yield

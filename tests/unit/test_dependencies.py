@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -31,6 +32,7 @@ def names(requirements: list[str]) -> set[str]:
     return {canonical(re.match(r"[\w.-]+", requirement)[0]) for requirement in requirements}
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Top-level modules from outside mrctl and the standard library that a file imports, wherever it does so."""
     found = set()

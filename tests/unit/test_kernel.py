@@ -1,4 +1,4 @@
-"""Kernels: an edited law reaches all that call it, nothing is compiled at import, and laws can be put in place."""
+"""Kernels: an edited law reaches all that call it, and laws can be put in place."""
 
 import ast
 import gc
@@ -28,7 +28,7 @@ from mrctl.loop.simulation import Simulation
 from mrctl.physics.files import models_folder
 
 PACKAGE = Path(mrctl.__file__).parent
-FEEDFORWARDS = ("model", "observer", "composite", "rls", "fel")  # the prior `model`, and learners
+FEEDFORWARDS = ("model", "observer", "composite")  # that call `features`, one that does, and `regressors`, that does
 # Asks the feedforwards of each copy whose folder it reads in a fork of its own; what mrctl imports is there already.
 FORKS = """
 import os
@@ -64,10 +64,8 @@ voltages = {}
 for name in names:
     hierarchy = Hierarchy([Scenario(prior="model", learner="none" if name == "model" else name)], robot)
     stage = hierarchy.learner
-    if name == "fel":
-        stage.weights[:] = 0.1
-    elif name != "model":
-        stage.rows[{"rls": "theta", "composite": "a", "observer": "disturbance"}[name]] = 0.1
+    if name != "model":
+        stage.rows[{"composite": "a", "observer": "disturbance"}[name]] = 0.1
     if name == "observer":  # its own law, not the model that it contains
         for _ in range(3):
             stage.learn(rate, np.zeros(1), twist, rate)
@@ -179,6 +177,8 @@ def test_promise_of_repeated(monkeypatch):
         run([added], ticks=20)
         added.add(Event(time=0.4, reference=there))
         run([added])
+        if tier == "ideal":
+            continue
         vector = TrackingVectorEnv(3, Scenario(reference=Line(speed=0.5, length=0.3), **common))
         vector.reset(seed=0)
         ends = sum(vector.step(np.zeros((3, 2)))[3].sum() for _ in range(150))
@@ -245,14 +245,6 @@ def test_edited_law(tmp_path, interpreter):
 def kernel_files():
     """Modules of the package that hold a kernel."""
     return [path for path in sorted(PACKAGE.rglob("*.py")) if re.search(r"^@kernel$", path.read_text(), re.MULTILINE)]
-
-
-def test_nothing_compiled_at_import():
-    """All files with kernels can be imported without Numba."""
-    names = [".".join(("mrctl", *path.relative_to(PACKAGE).with_suffix("").parts)) for path in kernel_files()]
-    assert {"mrctl.control.fel", "mrctl.loop.hierarchy", "mrctl.physics.plant"} <= set(names)
-    code = f"import sys, {', '.join(names)}; sys.exit('numba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 @kernel

@@ -254,20 +254,20 @@ def test_learns_late(robot, heading, first):
     for before in (first, 600.0):
         loop = Loop(robot, False, PERIOD, has_prior=heading)
         stage, prior = ModelReferenceAdaptive(loop, [Mrac()]), Prior([robot], False)
-        voltages, errors = [], []
-        for tick in range(round((before + 20.0) / PERIOD)):
-            c = coefficients[PERIOD * tick >= before]
-            v, v_dot = 0.8 + 0.3 * np.sin(PERIOD * tick), 0.3 * np.cos(PERIOD * tick)
-            x, rate = np.array([[v, v]]), np.array([[v_dot, v_dot]])
-            voltage = feature_matrix(x, rate, robot.half_track, np.ones(8)) @ c
-            learned = prior.output(x, rate) + stage.output(x, rate)
-            stage.prior = prior
-            stage.learn(np.zeros((1, 2)), np.zeros(1), x, voltage)
-            voltages.append(np.abs(voltage).max())
-            errors.append(np.abs(voltage - learned).max())
+        stage.prior = prior
+        t = PERIOD * np.arange(round((before + 20.0) / PERIOD))
+        x, rate = (np.repeat(one[:, None], 2, 1) for one in (0.8 + 0.3 * np.sin(t), 0.3 * np.cos(t)))
+        regressors = feature_matrix(x, rate, robot.half_track, np.ones(8))
+        voltages = np.where((t < before)[:, None], *(regressors @ c for c in coefficients))
+        errors = []
+        for k in range(len(t)):
+            now = slice(k, k + 1)
+            learned = prior.output(x[now], rate[now]) + stage.output(x[now], rate[now])
+            stage.learn(np.zeros((1, 2)), np.zeros(1), x[now], voltages[now])
+            errors.append(learned - voltages[now])
         assert (scale * stage.parameters[0]).any()
-        found.append(max(errors[-last:]))
-    assert found[1] < 1.2 * found[0] and found[0] < 0.1 * max(voltages[-last:])
+        found.append(np.abs(errors[-last:]).max())
+    assert found[1] < 1.2 * found[0] and found[0] < 0.1 * np.abs(voltages[-last:]).max()
 
 
 def test_tracking_step():

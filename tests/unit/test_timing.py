@@ -186,7 +186,7 @@ def polygon(name, radii, closed, speed, supply, smoothing):
     return Waypoints(points=points, closed=closed, speed=top, timing="limits", limits=limits), robot, top
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     st.sampled_from(sorted(ROBOTS)), st.lists(st.floats(0.2, 2), min_size=3, max_size=8), st.booleans(),
     st.floats(0.2, 1), st.floats(0.2, 1), st.floats(0.05, 2.0),
@@ -200,7 +200,7 @@ def test_every_limit_holds(name, radii, closed, speed, supply, smoothing):
     keeps_limits(*drawn)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     st.sampled_from(sorted(ROBOTS)), st.lists(st.floats(0.2, 2), min_size=3, max_size=8), st.floats(0.2, 1),
     st.floats(0.2, 1), st.floats(0.05, 0.5), st.floats(1e-3, 1.5), st.floats(-1, 1),
@@ -224,7 +224,7 @@ def test_every_limit_holds_from_a_start_speed(name, radii, speed, supply, smooth
         assert again._law.law.start == pytest.approx(first, rel=0.02, abs=1e-3)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.lists(st.floats(0.2, 2), min_size=3, max_size=8), st.floats(0.2, 1), st.floats(0.2, 1), st.floats(-0.3, 0.3))
 def test_every_limit_holds_in_reverse(radii, speed, supply, com_offset):
     """So they do backwards, where the centre of mass is on the other side of the axle, as seen from the motion."""
