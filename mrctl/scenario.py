@@ -171,7 +171,7 @@ class Scenario(Record):
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of a random offset from the initial pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """This seed determines initial offset and weights, and noise and biases of the sensors."""
+    """Seed of initial offset, weights, noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=10)] | None = None
     """Time constant in s of the filter on the velocities that the motion controller adds to the reference; values below
     the control period act as it. By default it is designed."""
