@@ -242,10 +242,10 @@ def test_many_visitors(server, visits, together):
 
 
 def test_rough_treatment(server, capfd):
-    """Random values of 112 inputs, sensible or not, from visitors that come and go: it drives on, and leaks nothing."""
+    """Random values of 56 inputs, sensible or not, from visitors that come and go: it drives on, and leaks nothing."""
     rng = random.Random(1)
     live = Live([Scenario()], server)
-    inputs = rng.sample(list(server.gui._gui_input_handle_from_uuid.values()), 112)
+    inputs = rng.sample(list(server.gui._gui_input_handle_from_uuid.values()), 56)
     last = server.gui.add_number("last", -1.0)
     live.session.step()  # compiles the laws, so that the visitors come while it drives
     before = threading.active_count()
