@@ -32,6 +32,13 @@ FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
 BOUNDS = Bounds(1.3, 2.7, 3.9, 1.35, 5.4)
 
 
+@pytest.fixture(autouse=True)
+def fewer(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`mppi` has a quarter of its samples, which makes it harder, but where its smoothness or nearness is judged."""
+    if request.function not in (test_smooth, test_crossing):
+        monkeypatch.setattr("mrctl.navigation.mppi.SAMPLES", 500)
+
+
 def crossing(speed: float, side: int = 1) -> Disc:
     """A disc that crosses x = 2 m along ±y, from y = ∓1.5 m on; its own x axis is that of its course."""
     return Disc(x=-1.5, y=-2.0 * side, radius=0.2, course=mrctl.Line(heading=side * np.pi / 2, speed=speed))
