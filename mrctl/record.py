@@ -97,7 +97,8 @@ def with_limits(description: str, field: FieldInfo) -> str:
     limits, words = bounds(field), {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
     if len(limits) < 2:
         return description
-    said = ", ".join(f"{words[kind]} {limits[kind]:.12g}" for kind in words if kind in limits)
+    numbers = {kind: str(n) if isinstance(n, int) else f"{n:.12g}" for kind, n in limits.items()}
+    said = ", ".join(f"{words[kind]} {numbers[kind]}" for kind in words if kind in limits)
     added = f"{said.capitalize()}."
     return description if description.endswith(added) else f"{description} {added}".lstrip()
 
@@ -173,8 +174,9 @@ class Record(BaseModel, metaclass=_Constructors):
     def _knows_moved_fields(cls, values: Any) -> Any:  # noqa: ANN401
         for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
             raise ValueError(f"{name}: {FIELD_GONE}; {cls.moved[name]}")
-        for name in (one for one in cls.foreign if isinstance(values, dict) and one in values):
-            raise ValueError(f"{name}: {cls.foreign[name]}")
+        for name in cls.foreign if isinstance(values, dict) else ():
+            if name in values:
+                raise ValueError(f"{name}: {cls.foreign[name]}")
         return values
 
     @classmethod

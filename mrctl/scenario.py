@@ -107,8 +107,8 @@ class Scenario(Record):
         **dict.fromkeys(
             ("base", "axes", "runs"), "is a field of a sweep, which `mrctl sweep FILE --out FOLDER` computes"
         ),
-        "controller": "a scenario names no controller of your own; `mrctl run FILE --controller NAME.py:NAME` drives "
-        "with one, and a sweep has a field controller",
+        "controller": "a scenario names no controller of your own; `mrctl run FILE --controller "
+        "my_file.py:MyController` drives with one, and a sweep has a field controller",
     }
 
     name: str = ""
@@ -133,7 +133,7 @@ class Scenario(Record):
     prior: PriorName = "none"
     """Model that the feedforward starts from; `true_model` has the true constants, for reference."""
     learner: LearnerName = "fel"
-    """Adaptive law, whose output is added to that of the prior. `observer`, `indi` and `l1` need the prior `model`."""
+    """Adaptive law, whose output is added to that of the prior. `observer`, `indi` and `l1` need a model as prior."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, which a tier sets."""
     kanayama: Kanayama = Kanayama()

@@ -31,7 +31,7 @@ FLAGS_ELSEWHERE = {
 """Flags of `check` and `tune`, and what they are called in the commands of `WITH_RECORDS`."""
 
 CONTROLLER_ELSEWHERE = {
-    "navigate": "a mission of this command drives with those of mrctl; with your own, simulate what "
+    "navigate": "a mission of this command drives with those of mrctl; with your own, simulate the scenario that "
     "mrctl.navigation.planning.prepared returns",
     "view": "a live session drives with those of mrctl; with your own, give mrctl run --controller and --out FOLDER, "
     "then mrctl view FOLDER",

@@ -169,10 +169,10 @@ class Computing(NamedTuple):
         here = versions() | self.origin() | {"code": code_digest(SHOWING_ROOMS)}
         if other := next((name for name, value in self.there.items() if here.get(name) != value), ""):
             who = f"worker {os.getpid()} on {os.uname().nodename}"
-            return JobOutcome(job, error=f"scheduler: {who} has another {other} than this process", fatal=True)
+            return JobOutcome(job, error=f"{who} has another {other} than this process", fatal=True)
         try:
             return JobOutcome(job, value=pickle.loads(self.computed[job])())  # noqa: S301 (from the process that asks)
         except InputError as error:
             return JobOutcome(job, error=str(error), fatal=True)
         except Exception as error:  # noqa: BLE001 (whatever the error is, the other computations go on)
-            return JobOutcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
+            return JobOutcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()), final=True)

@@ -124,7 +124,7 @@ def _driven(draws: Sequence[Draw], controller: FeedforwardName, plant: Perturbat
         first = bisect_left(ROOMS, True, key=lambda room: passes(one, one.width + room, changes))
         return one.width + ROOMS[first] if first < len(ROOMS) else np.inf
 
-    return list(map(needed, draws))
+    return [needed(one) for one in draws]
 
 
 def passes(one: Draw, width: float, changes: dict[str, Any]) -> bool:

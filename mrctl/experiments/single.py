@@ -149,7 +149,7 @@ def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
     ]
     lines += [f"failed {failure}"] if failure else []
     lines += faults_of(run) + _limited(run) + _unreached(scenario, run)
-    lines += _taken_back(scenario) + _slipped(scenario, run)
+    lines += _taken_back(scenario, run) + _slipped(scenario, run)
     rows = [
         [str(k + 1), *(_cell(name, scale * float(laps[name].values[k])) for name, (_, scale) in COLUMNS.items())]
         for k in np.flatnonzero(np.isfinite(laps["position_rmse"].values))
@@ -166,15 +166,17 @@ def _cell(name: str, value: float) -> str:
     return f"{value:.0f}" if name == "guard_actions" else number(value)
 
 
-def _taken_back(scenario: Scenario) -> list[str]:
+def _taken_back(scenario: Scenario, run: xr.Dataset) -> list[str]:
     """Says which differences of the plant an event takes back as it brings others, because it replaces them all."""
     plain, before, lines = Perturbation(), scenario.perturbation, []
+    end = float(run["time"].where(np.isfinite(run["x"])).max())
     for event in scenario.schedule:
-        if (now := event.perturbation) is None or event.time >= scenario.duration:
+        if (now := event.perturbation) is None or not event.time <= end:
             continue
         names = [
             name for name in Perturbation.model_fields
             if getattr(before, name) != getattr(now, name) == getattr(plain, name)
+            and not (name.startswith("payload_") and now.payload == 0)
         ]  # fmt: skip
         if names and now != plain:
             back = ", ".join(f"{name} goes back to {getattr(plain, name):g}" for name in names)

@@ -134,7 +134,7 @@ def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float) -> dic
         (scenario,) = replicates(one.scenario.replace(**changes), 1, one.seed)
         return simulate([scenario], threads=1, motion=avoiding("mppi", lag=lag))
 
-    results = list(map(driven, worlds))
+    results = [driven(one) for one in worlds]
     return {"runs": [ended(*case) for case in zip(results, worlds, strict=True)], "lag": fitted(results)}
 
 

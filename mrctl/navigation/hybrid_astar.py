@@ -144,7 +144,7 @@ def wider(where: Space, goal: Array, room: float) -> Space:
         reached = low + cell * np.column_stack([columns, rows])
         if np.any((reached < inner_low - cell) | (reached > inner_high)):
             return wide
-    raise NoWay(f"goal: there is no way to ({goal[0]:.2f}, {goal[1]:.2f})")
+    raise NoWay(f"goal: there is no way to ({goal[0]:.2f}, {goal[1]:.2f}) with a margin of {where.margin:g} m")
 
 
 def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, most: int = 500_000) -> Plan:

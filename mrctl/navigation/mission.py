@@ -112,8 +112,8 @@ def navigate(
             mission; with `window` and `mppi` the motion period is the multiple of the control period that is
             nearest to 0.05 s, and the prefilter, unless set, the shortest.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
-        speed: Largest speed in m/s; by default 0.9 of the robot's. With an avoider it is at most
-            `mrctl.navigation.planning.speed_in_sight`.
+        speed: Largest speed in m/s; by default 0.9 of the robot's. With an avoider it is at most that
+            from which it can stop within sight (`mrctl.navigation.planning.prepared`).
         margin: Clearance that the plan keeps in m.
         avoid: What keeps the robot from obstacles that are not on the map, or move, and which its lidar sees: nothing,
             so that it follows the plan in time (`none`), a filter that slows the time of the plan (`barrier`), or a

@@ -71,7 +71,7 @@ class Mppi(Reactive):
         nominal, twists, costs, bounds = self._nominal[row], self._twists, self._costs, self.bounds[row]
         knots = self._noise * (np.array(SAMPLE_DEVIATIONS) * (bounds.speed, bounds.rotation))
         nominal[:-1] = nominal[1:].copy()  # a period has passed
-        # One roll-out is nominal, one brakes, and one drives as the plan does. Without the last a robot stands where
+        # One roll-out is nominal, one brakes, and one drives about as the plan. Without the last a robot stands where
         # its plan is a loop that ends near it: all that it could do otherwise leads away at first.
         knots[0] = 0.0
         knots[1] = -bounds.speed, 0.0
@@ -91,7 +91,9 @@ class Mppi(Reactive):
 
 
 def twists_along(targets: Array, period: float) -> Array:
-    """Returns the twists from target to target, V in m/s and θ̇ in rad/s, `(n, 2)`; the first is that to the second.
+    """Returns the twist with which each target is reached from the one before, V in m/s and θ̇ in rad/s, `(n, 2)`.
+
+    The first target, which has none before it, gets the twist of the second.
 
     Args:
         targets: As those of `Scene`.

@@ -37,7 +37,7 @@ PATIENCE, WAITING_PATIENCE = 2, 4
 PLAN_MARGIN = 0.05  # m, margin of a plan
 REPLAN_MARGIN = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 REACTIVE_PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
-MAX_BARRIER_PERIOD = 0.2  # s, motion period beyond which the reaction of `barrier` is later than `REACTION_TIME`
+MAX_BARRIER_PERIOD = 0.2  # s, longest motion period with `barrier`, a little above `REACTION_TIME`; chosen
 # s from a scan until a robot brakes, for all avoiders: with `window` and `mppi` the wait for the next motion period,
 # the change of the request over that period, and the lag of the robot
 REACTION_TIME = 3 * REACTIVE_PERIOD
@@ -107,7 +107,7 @@ def prepared(
         task: World, map, start and goal.
         scenario: As for `mrctl.navigation.mission.navigate`.
         speed: Largest speed in m/s; by default 0.9 of the robot's. With an avoider it is at most
-            `speed_in_sight`.
+            `speed_in_sight`, and with `window` and `mppi` at most `speed_in_horizon`.
         margin: Clearance that the plan keeps in m.
         avoid: What keeps the robot from obstacles that its map does not have.
         twist: V in m/s and θ̇ in rad/s with which the robot drives at its start.

@@ -345,8 +345,8 @@ class Reactive(ABC):
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the requested twists at the start of the period, `(B, 2)`; `followed` leads to those just chosen.
 
-        These are within the bounds of the robots, except where a robot begins or ends its way back: there the limiter
-        acts. The arguments are those of `mrctl.control.stages.MotionStage`.
+        These are within the bounds of the robots, except where a robot begins or ends its way back or comes to stand:
+        there the limiter acts. The arguments are those of `mrctl.control.stages.MotionStage`.
         """
         self.begin(self._tick)
         now, last = self._period * self._tick, self.last

@@ -86,7 +86,8 @@ class Planner:
         """
         self.scenario = scenario
         given = [event.reference for event in scenario.events if event.reference is not None]
-        self.first, *_ = self.plans = [open_waypoints(plan) for plan in (scenario.reference, *given)]
+        self.plans = [open_waypoints(plan) for plan in (scenario.reference, *given)]
+        self.first = self.plans[0]
         self.sight, self.vehicle, self._replan = sight, vehicle, replan
         self.reset()
 

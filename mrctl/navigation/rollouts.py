@@ -226,7 +226,7 @@ def roll_out(
             from_v, from_omega = v, omega
             change, turn_change = bounds.acceleration * step, bounds.rotation_acceleration * step
             slowest = (abs(omega) - turn_change) / bounds.curvature  # V at which θ̇ has fallen as fast as it can
-            fastest = max(bounds.speed, v - change)  # a robot on a slower way than before brakes
+            fastest = max(bounds.speed, v - change, slowest)  # a robot on a slower way than before brakes
             v = min(max(wanted, v - change, slowest, 0.0), v + change, fastest)
             omega = min(max(turning, omega - turn_change), omega + turn_change)
             most = min(bounds.rotation, bounds.curvature * v)

@@ -12,6 +12,8 @@ from collections import deque
 import numpy as np
 
 from mrctl.kernel import Array
+from mrctl.navigation.barrier import approach
+from mrctl.navigation.planning import REACTION_TIME
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 
@@ -34,7 +36,7 @@ class Trail:
             acceleration: Largest |V̇| in m/s², with which the robot brakes.
         """
         self._footprint, self._curvature = footprint, curvature
-        self._fastest = np.sqrt(2 * acceleration * CHECKED_BEHIND)  # it then stops within what it looks ahead
+        self._fastest = float(approach(CHECKED_BEHIND, acceleration, REACTION_TIME))
         self._places = deque[Array](maxlen=MAX_PLACES)
 
     def add(self, pose: Array) -> None:

@@ -238,7 +238,7 @@ class _File:
 def _check_finite(element: ElementTree.Element, file: Path) -> None:
     """Refuses NaN, in whose place MuJoCo takes its default, and infinity, which only a range may have."""
     for name, value in element.items():
-        words = {word.lower().lstrip("+-") for word in value.split()} & {"nan", "inf", "infinity"}
+        words = {word.lower().lstrip("+-").partition("(")[0] for word in value.split()} & {"nan", "inf", "infinity"}
         if name not in NAMES and element.tag != "text" and (words if not name.endswith("range") else words & {"nan"}):
             whose = f"{element.tag} {element.get('name', '')}".strip()
             raise InputError(f"{file}: <{whose}> {name}: {value!r} is not finite")

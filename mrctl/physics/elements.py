@@ -129,11 +129,14 @@ def left_tyre_pairs(model: mujoco.MjModel) -> list[int]:
 
 
 def driven_through(model: mujoco.MjModel) -> list[str]:
-    """Names the geoms of the world that could collide but have no contact pair with the rear left wheel."""
-    wheel = model.geom("wheel_left").id
+    """Names the fixed geoms of the world that could collide, but not with the rear left wheel: they have no pair."""
+    wheel, kind, others = model.geom("wheel_left").id, model.geom_contype, model.geom_conaffinity
     paired = {int(g) for p in left_tyre_pairs(model) for g in (model.pair_geom1[p], model.pair_geom2[p])} - {wheel}
-    own = np.flatnonzero((model.geom_bodyid == 0) & ((model.geom_contype | model.geom_conaffinity) != 0))
-    return [part(model, int(g)) for g in own if g not in paired]
+    meets = (kind & others[wheel]) | (kind[wheel] & others)  # without a pair
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    return [
+        part(model, int(g)) for g in np.flatnonzero(fixed & ((kind | others) != 0) & (meets == 0)) if g not in paired
+    ]
 
 
 def is_level(model: mujoco.MjModel) -> bool:

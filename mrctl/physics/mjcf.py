@@ -117,8 +117,8 @@ def _compiled(world: str, steering: Steering | None, robot: RobotFile, obstacles
         model = spec.compile()
         nominal = _arranged(model, steering, robot)
         if geoms := driven_through(model):
-            how = 'give each wheel one, or the geom contype="0" conaffinity="0"'
-            text = f"{path}: the wheels pass through {', '.join(geoms)}, which has no contact pair with them; {how}"
+            how = 'give each wheel a pair with it, or the geom contype="0" conaffinity="0"'
+            text = f"{path}: no contact pair with the wheels, which pass through: {', '.join(geoms)}; {how}"
             warnings.warn(text, stacklevel=1)
         if obstacles.shapes:
             spec = _assembled(path, robot)
@@ -171,16 +171,17 @@ def _in_place_of_car(world: Path, path: Path, own: mujoco.MjSpec) -> mujoco.MjSp
     MuJoCo would look beside the world for the files that the robot's file includes, and for its meshes and images.
     """
     texts, files = {}, [path]
-
-    def renamed(include: re.Match) -> str:
-        """Gives an included file a name of its own: MuJoCo drops folders, and one of them may be called car.xml."""
-        if not (file := path.parent / include[2]).is_file():
-            return include[0]
-        files.append(file)
-        return f"{include[1]}included_{len(files)}.xml"
-
     for number, file in enumerate(files, start=1):  # which grows meanwhile
-        text = re.sub(r'(<include\s+file=")([^"]+)', renamed, file.read_text("utf-8", "replace"))
+
+        def renamed(include: re.Match, here: Path = file.parent) -> str:
+            """Gives an included file a name of its own: MuJoCo drops folders, and one may be called car.xml."""
+            found = next((one for one in (path.parent / include[2], here / include[2]) if one.is_file()), None)
+            if found is None or found in files:
+                return include[0]
+            files.append(found)
+            return f"{include[1]}included_{len(files)}.xml"
+
+        text = re.sub(r"""(<include\s+file\s*=\s*["'])([^"']+)""", renamed, file.read_text("utf-8", "replace"))
         texts[f"{CAR.path}.xml" if file == path else f"included_{number}.xml"] = text.encode()
     spec = mujoco.MjSpec.from_file(str(world), include=texts)
     assets = (("mesh", own.meshes, own.meshdir), ("texture", own.textures, own.texturedir))

@@ -503,7 +503,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     for folder in folders:
         check_codecs(folder)
     with contextlib.suppress(InputError), reading_chunks(path):  # all at once is faster; what is damaged is named below
-        found = zarr.open_group(path, mode="r", zarr_format=3).arrays()
+        found = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False).arrays()
         arrays = {Path(path) / name: array for name, array in found}
     for folder in folders:
         if folder not in arrays:

@@ -37,6 +37,8 @@ class JobOutcome(NamedTuple):
     """Why the job has no result, or ""."""
     fatal: bool = False
     """Whether every other job would end the same way, because the disk is full or the versions differ."""
+    final: bool = False
+    """Whether the job would end the same way another time."""
     value: Any = None
     """What the job returns, where it does not write it to a store."""
 
@@ -74,7 +76,8 @@ class Pool(Protocol):
 def carry_out(pool: Pool, jobs: Iterable[int], ended: Callable[[JobOutcome], None]) -> dict[int, str]:
     """Lets a pool compute jobs; returns why some were set aside, by job.
 
-    A job that kills its worker or raises an error is tried again after the others, alone, before it is set aside.
+    A job that kills its worker or raises an error is tried again after the others, alone, before it is set aside,
+    unless its outcome is final.
 
     Args:
         pool: The pool.
@@ -96,7 +99,7 @@ def carry_out(pool: Pool, jobs: Iterable[int], ended: Callable[[JobOutcome], Non
             tries[outcome.job] += 1
             if outcome.fatal:
                 raise InputError(f"{outcome.error}; what was done is kept")
-            if outcome.error and tries[outcome.job] < pool.tries:
+            if outcome.error and not outcome.final and tries[outcome.job] < pool.tries:
                 again.append(outcome.job)
                 continue
             if outcome.error:

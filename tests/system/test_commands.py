@@ -101,10 +101,19 @@ def test_event_after_the_arrival(tmp_path: Path, capsys: pytest.CaptureFixture) 
     line = mrctl.Waypoints(points=((0, 0), (0.2, 0), (0.4, 0)), closed=False, timing="limits", speed=0.5)
     late = mrctl.Event(time=2.5, perturbation=mrctl.Perturbation(payload=1.0))
     run = mrctl.Scenario(learner="none", laps=2, reference=line, goal=(0.4, 0.0, 0.0), events=(late,))
+    run = run.replace(perturbation={"mass_factor": 1.1})
     assert run.duration > late.time
     (tmp_path / "run.toml").write_text(run.to_toml())
     assert cli.main(["run", str(tmp_path / "run.toml")]) == 0
-    assert "event at 2.5 s: after the end of the run at 1." in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "event at 2.5 s: after the end of the run at 1." in out and "goes back" not in out
+
+
+def test_no_such_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """A file that is missing is named in one line, and nothing is printed."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["run", "nowhere.toml"]) == 2
+    assert capsys.readouterr() == ("", "mrctl: nowhere.toml: No such file or directory\n")
 
 
 def test_event_that_takes_back(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from test_commands import refused
 
 import mrctl
 from mrctl import InputError, cli
@@ -165,7 +166,7 @@ def test_older_results_open(whole: Path, tmp_path: Path) -> None:
     assert mrctl.open(tmp_path / "again.zarr").identical(found)
 
 
-def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> None:
+def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """In a notebook a store with a damaged shard opens, and gives what is whole, in any order that is asked for."""
     shutil.copytree(whole / "store", tmp_path / "store")
     found, undamaged = mrctl.open(tmp_path / "store"), mrctl.open(whole / "store")
@@ -179,6 +180,7 @@ def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> 
     command = [sys.executable, "-m", "mrctl", "export", str(tmp_path / "store"), "--to", "csv", "--out", "x.csv"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr  # zarr's other readers say nothing
+    assert "damaged" in refused(capsys, "run", str(tmp_path / "store"), "--run", "2")
 
 
 def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def test_other_workers(what, cluster, tmp_path, monkeypatch):
         monkeypatch.setattr(journal, "code_digest", lambda but: "another")
     else:
         monkeypatch.setattr(navigation_suite.mjcf, "digest", lambda model: "another")
-    with pytest.raises(InputError, match=f"^scheduler: worker .* has another {what} than this process"):
+    with pytest.raises(InputError, match=f"^worker .* has another {what} than this process"):
         list(navigation_suite.suite(Scenario(), "quick", tmp_path / "out", cluster[0]))
     assert len((tmp_path / "out" / "limits.jsonl").read_text().splitlines()) == 1
 

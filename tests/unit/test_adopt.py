@@ -338,6 +338,17 @@ def test_file_that_includes_the_default_robot(tmp_path):
         assert has(model, "numeric", "mine") and robot.mass == pytest.approx(mjcf.build()[1].mass + 10)
 
 
+def test_nested_includes(tmp_path):
+    """Quotes of either kind, a file beside the one that includes it, and a comment that names the file itself."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "inner.xml").write_text('<mujoco><custom><numeric name="mine" data="1"/></custom></mujoco>')
+    (tmp_path / "parts" / "outer.xml").write_text("<mujoco><include file='inner.xml'/></mujoco>")
+    text = (models_folder() / "car.xml").read_text()
+    includes = '<!-- <include file="mine.xml"/> --><include file = "parts/outer.xml"/></mujoco>'
+    (tmp_path / "mine.xml").write_text(text.replace("</mujoco>", includes))
+    assert has(mjcf.build(robot=mrctl.load_robot(tmp_path / "mine.xml"))[0], "numeric", "mine")
+
+
 @pytest.mark.parametrize(("name", "steering"), [("turtlebot", "caster"), ("racecar", "rigid"), ("car", "compliant")])
 def test_robot_brings_its_steering(name, steering):
     """A scenario that names a robot and no steering drives with that robot's, and its result says which."""

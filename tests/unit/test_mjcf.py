@@ -274,9 +274,12 @@ def test_floor_without_pairs(folder):
     text = (folder / "flat.xml").read_text()
     bump = '<geom name="bump" type="box" size="0.3 0.3 0.005"/>'
     look = bump.replace("bump", "look").replace("/>", ' contype="0" conaffinity="0"/>')
-    (folder / "flat.xml").write_text(text.replace("<worldbody>", f"<worldbody>{bump}{look}"))
+    kerb = f'<body name="fixed">{bump.replace("bump", "kerb")}</body>'
+    (folder / "flat.xml").write_text(text.replace("<worldbody>", f"<worldbody>{bump}{kerb}{look}"))
     for robot in (RobotFile(), RobotFile(path="turtlebot")):
-        with pytest.warns(UserWarning, match="the wheels pass through bump, which has no contact pair") as said:
+        with pytest.warns(
+            UserWarning, match="no contact pair with the wheels, which pass through: bump, kerb; give"
+        ) as said:
             mjcf.load(str(folder / "flat.xml"), robot=robot)
         assert len(said) == 1
     world = folder / "flat.xml"

@@ -294,8 +294,8 @@ def test_paths():
         ),
         (
             {"controller": "a.py:A"},
-            "controller: a scenario names no controller of your own; `mrctl run FILE --controller NAME.py:NAME` drives "
-            "with one, and a sweep has a field controller",
+            "controller: a scenario names no controller of your own; `mrctl run FILE --controller "
+            "my_file.py:MyController` drives with one, and a sweep has a field controller",
         ),
         ({"robot": 3}, "robot: must be a record, or a table of its fields, or its path"),
         ({"events": Event(time=1, learning=False)}, "events: must be a list of records (and 7 more)"),
