@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
-from mrctl.navigation.plan import SWITCH_COST, Plan
-from mrctl.navigation.steer import CHECK_SPACING, MAX_PIECES, Curve, advance, sample, shortest, steer
+from mrctl.navigation.plan import Plan
+from mrctl.navigation.steer import CHECK_SPACING, MAX_PIECES, SWITCH_COST, Curve, advance, sample, shortest, steer
 from mrctl.record import InputError
 from mrctl.theory.clearance import clearance, cover, gap, point_to_polygon
 from mrctl.theory.grid import Field, near_field, value

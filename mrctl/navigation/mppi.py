@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
+from mrctl.loop.goals import ARRIVAL_SPEED
 from mrctl.navigation.reactive import Reactive
 from mrctl.navigation.replanning import Replan
 from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH_COST, Considered, Scene, roll_out
@@ -71,11 +72,12 @@ class Mppi(Reactive):
         nominal, twists, costs, bounds = self._nominal[row], self._twists, self._costs, self.bounds[row]
         knots = self._noise * (np.array(SAMPLE_DEVIATIONS) * (bounds.speed, bounds.rotation))
         nominal[:-1] = nominal[1:].copy()  # a period has passed
-        # One roll-out is nominal, one brakes, and one drives about as the plan. Without the last a robot stands where
-        # its plan is a loop that ends near it: all that it could do otherwise leads away at first.
-        knots[0] = 0.0
+        knots[0] = 0.0  # one roll-out is nominal, and another brakes
         knots[1] = -bounds.speed, 0.0
-        knots[2] = (twists_along(scene.targets, period) - nominal)[KNOT_STEPS]
+        # One of a robot that stands drives about as its plan, else it would go on standing where that is a loop which
+        # ends near it: all others lead away at first. On the way it would draw the mean nearer to what is beside it.
+        if last[0] < ARRIVAL_SPEED:
+            knots[2] = (twists_along(scene.targets, period) - nominal)[KNOT_STEPS]
         state = pose, twist, last, self._lag, period, bounds, scene
         temperature = TEMPERATURE * min(1.0, bounds.speed / ORDINARY_SPEED) ** 2
         worth = MAX_COST_DIFFERENCE * temperature

@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.steer import CHECK_SPACING
+from mrctl.navigation.steer import CHECK_SPACING, SWITCH_COST
 from mrctl.record import InputError
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import Limits
 
-SWITCH_COST = 0.5  # m, cost of a change of direction
 POINT_SPACING = 0.25  # m, about the distance of the points that the spline of a reference goes through
 MIN_CHORD = 1e-3  # m; the curvature at an end is computed as if its chord were at least that long
 NEARLY_STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array, kernel
 
 MAX_PIECES = 5
+SWITCH_COST = 0.5  # m, cost of a change of direction in a plan
 CHECK_SPACING = 0.05  # m, largest distance of the poses on a way, which are held against the obstacles
 QUARTER_TURN = np.pi / 2
 MIN_PIECE = 1e-10  # a shorter arc or line, or one that is by as much negative, is rounding; for radius 1

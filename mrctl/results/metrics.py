@@ -151,7 +151,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
 
     Returns:
         `METRICS` with dims (run, lap), NaN beyond the laps of a run, and units in attrs; `laps`, the number of laps of
-        each run; `failed` and `failure_time` as in the result. Coordinate `lap` counts from 1.
+        each run; `failed`, `failure` and `failure_time` as in the result. Coordinate `lap` counts from 1.
 
     Raises:
         InputError: The result lacks a variable or has no sample, or a lap is shorter than the control period.
@@ -175,6 +175,8 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     variables["laps"] = ("run", counts, {"units": "1", "long_name": "whole laps"})
     variables["failed"] = ("run", [laps.failed is not None for laps in divisions])
     nan = np.full(size, np.nan)
+    if "failure" in runs:
+        variables["failure"] = ("run", runs["failure"].values)
     variables["failure_time"] = ("run", runs["failure_time"].values if "failure_time" in runs else nan, {"units": "s"})
     coords = {name: ("run", runs[name].values) for name in ("run", *PER_RUN) if name in runs.coords}
     return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
