@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.loop.goals import ARRIVAL_SPEED
 from mrctl.navigation.reactive import Reactive
 from mrctl.navigation.replanning import Replan
 from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH_COST, Considered, Scene, roll_out
@@ -74,9 +73,9 @@ class Mppi(Reactive):
         nominal[:-1] = nominal[1:].copy()  # a period has passed
         knots[0] = 0.0  # one roll-out is nominal, and another brakes
         knots[1] = -bounds.speed, 0.0
-        # One of a robot that stands drives about as its plan, else it would go on standing where that is a loop which
-        # ends near it: all others lead away at first. On the way it would draw the mean nearer to what is beside it.
-        if last[0] < ARRIVAL_SPEED:
+        # One drives about as the plan, else a robot would go on standing where that is a loop which ends near it: all
+        # others lead away at first. But the plan knows nothing of what moves, and leads nearer to it.
+        if not scene.movers[:, 2:4].any():
             knots[2] = (twists_along(scene.targets, period) - nominal)[KNOT_STEPS]
         state = pose, twist, last, self._lag, period, bounds, scene
         temperature = TEMPERATURE * min(1.0, bounds.speed / ORDINARY_SPEED) ** 2
