@@ -32,7 +32,7 @@ def errors(result):
 
 def test_errors_of_the_start():
     """The first estimate errs as much as is stated, and the filter knows that; by default as a fix does."""
-    count = 150
+    count = 400
     for sensing, sigma, turn in (({}, 0.003, 0.003), (FAR, 0.5, 0.4)):
         loop = Simulation(runs(count, **sensing))
         mean, truth = loop.estimator.memory["mean"][:, :3], loop.plant.reading["pose"]

@@ -588,11 +588,15 @@ def small_files(path, job):
     return compute(path, job)
 
 
-def test_disk_full(file, sweep, tmp_path, whole, capsys):
+FULL = partial(filling_disk, moment=4), "No space left on device"  # from job 2 on
+
+
+@pytest.mark.parametrize(("work", "reason"), [FULL, (small_files, "File too large")])
+def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
     """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
     store = tmp_path / "store"
-    with mock.patch("mrctl.sweep.jobs.compute", small_files):
-        assert "File too large; what was done is kept" in refused(capsys, "sweep", file, "--out", store, "--workers", 1)
+    with mock.patch("mrctl.sweep.jobs.compute", work):
+        assert f"{reason}; what was done is kept" in refused(capsys, "sweep", file, "--out", store, "--workers", 1)
     assert Store(store).done() == {0, 1}
     assert mrctl.open(store).sizes["run"] == 10 and mrctl.open(store).attrs["unfinished"] == 14
     with mock.patch("mrctl.sweep.store.os.fsync", side_effect=OSError(errno.ENOSPC, "No space left on device")):
