@@ -187,9 +187,8 @@ def test_radii_of_nominal_robots_are_not_doubted(tier, localisation):
     walls = (Box(x=0, y=2.5, length=6, width=0.2), Box(x=0, y=-2.5, length=6, width=0.2))
     sensing = Sensing(tier=tier, localisation=localisation)
     scenario = Scenario(sensing=sensing, laps=2, prior="model", learner="none", obstacles=Obstacles(shapes=walls))
-    count = 12 if localisation == "fixes" else 6
-    simulation = Simulation([scenario.replace(seed=2000 + k) for k in range(count)])
-    before, doubts = np.zeros((count, 2)), 0
+    simulation = Simulation([scenario.replace(seed=2000 + k) for k in range(12)])
+    before, doubts = np.zeros((12, 2)), 0
     while simulation.running:
         simulation.step()
         means = simulation.estimator.memory["drift"].copy()  # which begin again at exactly 0
