@@ -30,13 +30,11 @@ FLAGS_ELSEWHERE = {
 }  # fmt: skip
 """Flags of `check` and `tune`, and what they are called in the commands of `WITH_RECORDS`."""
 
-CONTROLLER_ELSEWHERE = {
-    "navigate": "a mission of this command drives with those of mrctl; with your own, simulate the scenario that "
-    "mrctl.navigation.planning.prepared returns",
-    "view": "a live session drives with those of mrctl; with your own, give mrctl run --controller and --out FOLDER, "
-    "then mrctl view FOLDER",
-}
-"""Commands without controllers of the user, and what to do instead."""
+CONTROLLER_OF_VIEW = (
+    "controller: a live session drives with those of mrctl; with your own, give mrctl {} --controller and --out "
+    "FOLDER, then mrctl view FOLDER"
+)
+"""Message for a controller of the user in a live session, with the command that drives it."""
 
 POSE_FLAGS = "--goal", "--start", "--initial-pose"
 """Flags whose values may be written as x,y,θ."""
@@ -120,8 +118,8 @@ def refuse_known(arguments: Sequence[str]) -> None:
     for place, flag in enumerate(arguments):
         if flag.startswith("--"):
             name = flag[2:].partition("=")[0].replace("-", "_")
-            if name == "controller" and arguments[0] in CONTROLLER_ELSEWHERE:
-                raise InputError(f"controller: {CONTROLLER_ELSEWHERE[arguments[0]]}")
+            if name == "controller" and arguments[0] == "view":
+                raise InputError(CONTROLLER_OF_VIEW.format("run"))
             Scenario.refuse_moved(name)
             behind = any(before.startswith("reference:") for before in arguments[:place])
             if arguments[0] in ("run", "view") and name.split(".")[0] == "reference" and not behind:

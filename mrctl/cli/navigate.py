@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mrctl.cli.arguments import NOT_OF_MISSIONS, fields_set
+from mrctl.cli.arguments import CONTROLLER_OF_VIEW, NOT_OF_MISSIONS, fields_set
 from mrctl.cli.flags import EXPLAINED_FIELDS, is_short_help, partial_record
 from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, show, warn_if_impossible
 from mrctl.record import InputError, Record
@@ -39,6 +39,7 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
         avoid: Literal["none", "barrier", "window", "mppi"] = "none",
         out: Path | None = None,
         json: bool = False,
+        controller: tuple[str, ...] = (),
         view: bool = False,
         port: int = 8080,
         suite: bool = False,
@@ -70,6 +71,9 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
                 around what is in the way (`window`, `mppi`).
             out: Write the result, the table in JSON and the figures to this folder.
             json: Print JSON instead of a table.
+            controller: Controller of your own for the first robot, written as for mrctl suite, such as
+                my_file.py:MyFeedforward or model+composite+feedback=my_file.py:MyFeedback; a motion controller takes
+                the place of --avoid. With --suite, controllers of your own to compare with the others.
             view: Instead of a table, show the mission live in the browser, where clicks set further goals.
             port: Number of the port to listen on, with --view.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
@@ -89,18 +93,26 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
             own = {"prior", "learner", "perturbation", "seed", "initial-spread", "goal", "start", "map", "compare"}
             if world or (own | {"speed", "margin", "avoid", "json", "view"}) & fields_set(arguments):
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
-            return _navigate_suite(chosen, quick, out or Path("navigate_suite"), scheduler)
+            return _navigate_suite(chosen, controller, quick, out or Path("navigate_suite"), scheduler)
         if quick or scheduler is not None:
             raise InputError(f"{'quick' if quick else 'scheduler'}: belongs to --suite")
         if not world:
             raise InputError("world: none given; see mrctl navigate --help")
         if Path(world).is_dir():
-            return _repeat_mission(Path(world), arguments, out, json)
+            return _repeat_mission(Path(world), arguments, out, json, controller)
         if view and (out is not None or json):
             raise InputError("view: a live session has no --out and --json")
+        if view and controller:
+            raise InputError(CONTROLLER_OF_VIEW.format("navigate"))
         if ":" not in world and not Path(world).is_file():
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
         check_world(chosen.world, chosen.robot)
+        front, own = _own(controller)
+        if front is not None:
+            if {"prior", "learner"} & fields_set(arguments):
+                form = "a feedforward of mrctl stands in front of it, as in model+my_file.py:MyFeedforward"
+                raise InputError(f"controller: {form}; leave --prior and --learner out")
+            chosen = chosen.replace(**FEEDFORWARDS[front])
         warn_if_impossible(chosen)
         from mrctl.navigation.mission import Order
         from mrctl.navigation.tasks import task_of
@@ -113,7 +125,7 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
             return viewing.mission(order, "127.0.0.1", port)
         from mrctl.experiments import mission
 
-        found = mission.run(world, order, out, json)
+        found = mission.run(world, order, out, json, own)
         show(found, out, json)
         _expect_arrival(found.ended)
 
@@ -121,22 +133,38 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
     return navigate
 
 
-def _navigate_suite(scenario: Scenario, quick: bool, out: Path, scheduler: str | None) -> None:
+def _own(controller: Sequence[str]) -> tuple[FeedforwardName | None, str | None]:
+    """Returns the feedforward of mrctl in front of a mission's controller of the user, and that without it, or None."""
+    if not controller:
+        return None, None
+    if len(controller) > 1:
+        raise InputError("controller: a mission has one of yours; --suite compares several")
+    from mrctl.loop import user_files
+
+    front, own, _ = user_files.behind(controller[0])
+    return front, own
+
+
+def _navigate_suite(
+    scenario: Scenario, controllers: Sequence[str], quick: bool, out: Path, scheduler: str | None
+) -> None:
     """Drives the suite of navigation: `mrctl navigate --suite`."""
     from mrctl.experiments import navigation_suite
 
-    for tables in navigation_suite.suite(scenario, "quick" if quick else "core", out, scheduler):
+    for tables in navigation_suite.suite(scenario, "quick" if quick else "core", out, scheduler, controllers):
         print(tables)
 
 
-def _repeat_mission(folder: Path, arguments: Sequence[str], out: Path | None, json: bool) -> None:
+def _repeat_mission(
+    folder: Path, arguments: Sequence[str], out: Path | None, json: bool, controller: Sequence[str]
+) -> None:
     """Drives a saved mission again and compares it with what was saved: `mrctl navigate FOLDER`."""
-    new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json"})
+    new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json", "--controller"})
     if new and (folder / "mission.json").exists():
         raise InputError(f"{new[0].removeprefix('--')}: {folder} holds a mission, which is driven as it was")
     from mrctl.experiments import mission
 
-    found, departs = mission.repeat(folder, out, json)
+    found, departs = mission.repeat(folder, out, json, _own(controller)[1])
     show(found, out, json)
     expect_same(folder, departs, json)
     _expect_arrival(found.ended)

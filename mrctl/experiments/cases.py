@@ -11,9 +11,11 @@ import xarray as xr
 from scipy.optimize import brentq
 
 from mrctl.control.pid import Pid
+from mrctl.loop import user_files
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.scenario import COMPARED, FEEDFORWARDS, Event, FeedforwardName, Scenario, replicates
+from mrctl.record import InputError
+from mrctl.scenario import COMPARED, FEEDFORWARDS, Event, FeedforwardName, Scenario, feedforward_name, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, StopAndGo, Waypoints, random_spline
@@ -154,6 +156,30 @@ PARTS = {
     "floor": "Half the physics step: what the integrator resolves",
 }
 UNCHANGED = ("steady", "fault", "course", "tier", "steering")  # parts in whose runs nothing changes between the laps
+
+
+def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str], base: Scenario | None = None) -> Choices:
+    """Returns what drives the runs, by the name of the feedforward or of the user's class.
+
+    Args:
+        feedforwards: Names of feedforwards of mrctl.
+        controllers: Controllers of the user, each as for `mrctl.loop.user_files.behind`: with a feedforward of mrctl in
+            front, as in `model+composite+motion=my_file.py:MyMotion`, or without one.
+        base: Scenario on which the user's controllers are tried for a few ticks; by default the default one.
+
+    Raises:
+        InputError: A controller is bad, or its name is taken.
+    """
+    choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
+    for entry in controllers:
+        front, stages, parts = user_files.behind(entry)
+        name = feedforward_name(front, "+".join(part.title for part in parts))
+        if name in choices:
+            raise InputError(f"controller: the name {name} is taken")
+        own = user_files.absolute(stages)
+        user_files.trial(own, (base or Scenario()).replace(laps=1, **FEEDFORWARDS[front]))
+        choices[name] = Choice(**FEEDFORWARDS[front], controller=own)
+    return choices
 
 
 def cases(mode: Mode, seeds: int, random: int) -> list[Case]:

@@ -21,11 +21,13 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 import xarray as xr
 
-from mrctl.experiments.cases import HARD
+from mrctl.control.stages import Stages
+from mrctl.experiments.cases import HARD, Choice, by_name
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.suite_tables import titled
 from mrctl.experiments.tables import Table, frame, number, share_cell, wins_cell
 from mrctl.kernel import Array
+from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.runs import simulate
 from mrctl.navigation.generators import corridor, corridor_width
@@ -33,13 +35,14 @@ from mrctl.navigation.planning import PATIENCE, Query, planned
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
+from mrctl.scenario import FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import LIMIT_SHARE, Limits
 
 CONTROLLERS: tuple[FeedforwardName, ...] = ("none", "model", "fel", "model+composite")
+RIVALS: tuple[FeedforwardName, ...] = ("none", "model")  # with which the others are compared
 PLANTS: dict[str, Perturbation] = {
     "nominal": Perturbation(),
     "all": PERTURBATIONS["all"],
@@ -73,10 +76,52 @@ class Draw(NamedTuple):
     goal: Pose
 
 
+class Contender(NamedTuple):
+    """A velocity controller that is compared, of mrctl or of the user."""
+
+    name: str
+    choice: Choice
+    digest: str = ""
+    """Digest of the user's files."""
+
+    @property
+    def key(self) -> Any:  # noqa: ANN401
+        """What the journal calls it; after an edit of the user's files another one."""
+        return [self.name, self.choice.controller, self.digest] if self.digest else self.name
+
+    def stages(self) -> Stages:
+        """Returns the user's stages, as arguments of `simulate`.
+
+        Raises:
+            InputError: Their files are missing, or are not those with which the suite began.
+        """
+        if not (own := self.choice.controller):
+            return {}
+        if user_files.digest(own) != self.digest:
+            raise InputError(f"controller: {own}, or a file that it imports, is not as it was when the suite began")
+        return user_files.load(own)
+
+
+def contenders(base: Scenario, controllers: Sequence[str]) -> list[Contender]:
+    """Returns those of `CONTROLLERS`, and the user's.
+
+    Args:
+        base: The robot on which the user's are tried.
+        controllers: The user's, as for `by_name`.
+
+    Raises:
+        InputError: A controller of the user is bad, or its name is taken.
+    """
+    return [
+        Contender(name, choice, user_files.digest(choice.controller) if choice.controller else "")
+        for name, choice in by_name(CONTROLLERS, controllers, base).items()
+    ]
+
+
 class Series(NamedTuple):
     """The drives of all draws on all plants with one controller at one speed."""
 
-    controller: FeedforwardName
+    contender: Contender
     speed: int
     """Index of the speed in `SPEEDS`."""
     posture_known: bool = False
@@ -85,7 +130,7 @@ class Series(NamedTuple):
     @property
     def key(self) -> list[Any]:
         """What the journal calls it."""
-        return [self.controller, "true posture" if self.posture_known else SPEEDS[self.speed]]
+        return [self.contender.key, "true posture" if self.posture_known else SPEEDS[self.speed]]
 
 
 class Found(NamedTuple):
@@ -105,14 +150,17 @@ class Found(NamedTuple):
     """Speeds at which the corridors are driven, in m/s."""
     impassable: int
     """Number of corridors that were left out, for no plan goes through them."""
+    controllers: Sequence[str]
+    """Names of the controllers, among them `none` and `model`."""
 
 
-def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
+def drive(base: Scenario, mode: Mode, compared: Sequence[Contender], journal: Journal) -> Found:
     """Drives all draws at all speeds with all controllers on all plants; says first how long that takes.
 
     Args:
         base: Robot, steering, sensing and all else that is the same for all.
         mode: Which suite.
+        compared: The controllers.
         journal: What was driven already, by controller and speed, which is kept there.
 
     Raises:
@@ -124,18 +172,18 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     speeds = [share * vehicle.robot.max_speed for share in SPEEDS]
     complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
     draws = drawn(lambda seed: draw(vehicle, seed, width, speeds), count, complaint)
-    every = [Series(name, k) for name in CONTROLLERS for k in range(len(SPEEDS))]
-    every += [Series(name, len(SPEEDS) - 1, posture_known=True) for name in CONTROLLERS]
+    every = [Series(one, k) for one in compared for k in range(len(SPEEDS))]
+    every += [Series(one, len(SPEEDS) - 1, posture_known=True) for one in compared]
     left = [series for series in every if series.key not in journal]
     simulated = sum(one.references[series.speed].period for series in left for one in draws) * len(PLANTS)
     seconds = simulated / SIMULATED_PER_SECOND
     print(f"{count * len(PLANTS) * len(left):,} runs, {journal.expected(seconds, len(left))}", flush=True)
-    size = len(CONTROLLERS), len(PLANTS), count
+    size = len(compared), len(PLANTS), count
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
     plants, corners = list(PLANTS.values()), vehicle.footprint
     drives = [Computation(series.key, partial(_driven, series, base, plants, draws, corners)) for series in every]
     for series, driven in zip(every, journal.results(drives), strict=True):
-        c, widths = CONTROLLERS.index(series.controller), np.array(driven, float)
+        c, widths = compared.index(series.contender), np.array(driven, float)
         if series.posture_known:
             known[c] = widths[0]
         else:
@@ -145,7 +193,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         fastest = one.references[-1]
         poses = fastest.sample(np.arange(0, fastest.period, 0.02)).pose
         plans.append(corridor_width(vehicle.footprint, poses, one.seed, **SHAPE))
-    return Found(needed, off, known, on_reference, np.array(plans), speeds, draws[-1].seed + 1 - count)
+    names, impassable = [one.name for one in compared], draws[-1].seed + 1 - count
+    return Found(needed, off, known, on_reference, np.array(plans), speeds, impassable, names)
 
 
 def drawn(make: Callable[[int], T | None], count: int, complaint: str) -> list[T]:
@@ -197,7 +246,7 @@ def _driven(
 
 def _simulated(series: Series, base: Scenario, plants: Sequence[Perturbation], draws: Sequence[Draw]) -> xr.Dataset:
     """Drives all draws on all plants; run p · D + d is draw d of D on plant p."""
-    own = base.replace(**FEEDFORWARDS[series.controller], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
+    own = base.replace(**series.contender.choice.pair, laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     if series.posture_known:
         own = own.replace(sensing=own.sensing.replace(estimator="truth"))
     scenarios = [
@@ -205,7 +254,8 @@ def _simulated(series: Series, base: Scenario, plants: Sequence[Perturbation], d
         for plant in plants
         for one in draws
     ]
-    return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)], threads=1)
+    robots = [replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)]
+    return simulate(robots, threads=1, **series.contender.stages())
 
 
 def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
@@ -239,19 +289,19 @@ def tables(found: Found, shown: str) -> list[Table]:
 def values(found: Found) -> dict[str, Any]:
     """Returns what was found for JSON."""
     found_values = {name: np.asarray(part).tolist() for name, part in found._asdict().items()}
-    return {"controllers": CONTROLLERS, "plants": list(PLANTS)} | found_values
+    return {"plants": list(PLANTS)} | found_values
 
 
 def critical_widths(found: Found, shown: str) -> Table:
     """Returns the table of the critical widths at the largest speed, with the wins over PID and over `model`."""
     needed, rows = found.needed[-1], []
     for plant, own in zip(PLANTS, needed.swapaxes(0, 1), strict=True):
-        for name, one in zip(CONTROLLERS, own, strict=True):
+        for name, one in zip(found.controllers, own, strict=True):
             there = int(np.isfinite(one).sum())
             share = share_cell(there, len(one))
             rows.append([plant, titled(name), share, quantile_cell(one, 1e3), quantile_cell(one - found.plans, 1e3)])
-            for rival in ("none", "model"):
-                wins = superiority(one, own[CONTROLLERS.index(rival)], floor=TIE)
+            for rival in RIVALS:
+                wins = superiority(one, own[found.controllers.index(rival)], floor=TIE)
                 rows[-1].append("" if rival == name else wins_cell(wins))
     header = [
         "plant",
@@ -265,8 +315,7 @@ def critical_widths(found: Found, shown: str) -> Table:
     says = (
         f"At 95 % success the plans themselves need {quantile_cell(found.plans, 1e3)} mm; corridors left out because "
         f"no plan goes through: {found.impassable}. In paired draws, with 95 % confidence and differences up to "
-        f"{1e3 * TIE:.0f} mm as ties: {against('none', needed, TIE)}; "
-        f"{against('model', needed, TIE)}."
+        f"{1e3 * TIE:.0f} mm as ties: {against(found.controllers, needed, TIE)}."
     )
     return Table(f"Critical width of a corridor at {found.speeds[-1]:.2f} m/s ({shown})", says, frame(rows, header))
 
@@ -277,13 +326,13 @@ def critical_speeds(found: Found, shown: str) -> Table:
     fits = np.cumprod(found.needed <= found.plans + ALLOWANCE, axis=0).sum(axis=0)
     critical, rows = np.array([0.0, *found.speeds])[fits], []
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
-        for name, one in zip(CONTROLLERS, own, strict=True):
+        for name, one in zip(found.controllers, own, strict=True):
             counts = " / ".join(f"{np.mean(one >= speed):.2f}" for speed in found.speeds)
             rows.append([plant, titled(name), quantile_cell(-one, -1), counts])
     header = ["plant", "controller", "critical speed, m/s", "success up to each speed"]
     says = (
         f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
-        f"In paired draws, with 95 % confidence: {against('none', -critical, 0)}; {against('model', -critical, 0)}."
+        f"In paired draws, with 95 % confidence: {against(found.controllers, -critical, 0)}."
     )
     return Table(f"Critical speed with an allowance of {1e3 * ALLOWANCE:.0f} mm ({shown})", says, frame(rows, header))
 
@@ -292,7 +341,7 @@ def budget(found: Found, shown: str) -> Table:
     """Returns the table of the allowance with all errors, without the map's, and without one of the others too."""
     rows, gains = [], {}
     for p, plant in enumerate(PLANTS):
-        for c, name in enumerate(CONTROLLERS):
+        for c, name in enumerate(found.controllers):
             every = found.map_off[c, p], found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
             parts = [needed - found.plans for needed in every]
             rows.append([plant, titled(name), *(quantile_cell(part, 1e3) for part in parts)])
@@ -331,19 +380,22 @@ def finite_text(value: float) -> str:
     return "∞" if value == np.inf else "–" if not np.isfinite(value) else number(value, 4) if value else "0"
 
 
-def against(rival: FeedforwardName, samples: Array, floor: float) -> str:
-    """Returns in words who beats or loses to a rival, and where.
+def against(names: Sequence[str], samples: Array, floor: float) -> str:
+    """Returns in words who beats or loses to PID alone and to `model`, and where.
 
     Args:
-        rival: The rival.
+        names: Names of the controllers, among them the rivals.
         samples: What they need, `(controllers, plants, draws)`; less is better.
         floor: Largest difference that counts as a tie, in the unit of the samples.
     """
-    verdicts = {"better": [], "worse": []}
-    for c, name in enumerate(CONTROLLERS):
-        for p, plant in enumerate(PLANTS):
-            wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=floor)
-            if name != rival and (wins.low > 0.5 or wins.high < 0.5):
-                verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{titled(name)}` ({plant})")
-    parts = [f"{word} than `{titled(rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names]
-    return "; ".join(parts) or f"none differs from `{titled(rival)}`"
+    parts = []
+    for rival in RIVALS:
+        verdicts = {"better": [], "worse": []}
+        for c, name in enumerate(names):
+            for p, plant in enumerate(PLANTS):
+                wins = superiority(samples[c, p], samples[names.index(rival), p], floor=floor)
+                if name != rival and (wins.low > 0.5 or wins.high < 0.5):
+                    verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{titled(name)}` ({plant})")
+        found = [f"{word} than `{titled(rival)}` are {', '.join(who)}" for word, who in verdicts.items() if who]
+        parts += found or [f"none differs from `{titled(rival)}`"]
+    return "; ".join(parts)

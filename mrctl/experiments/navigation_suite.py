@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,23 +22,28 @@ class Part(NamedTuple):
 
     files: str
     """Name of its files, without their endings."""
-    drive: Callable[[Scenario, Mode, Journal], Any]
-    """Drives its runs; says first how long that takes."""
+    drive: Callable[..., Any]
+    """Drives its runs, with a scenario, a mode, the controllers if it `compares` them, and a journal; says first how
+    long that takes."""
     tables: Callable[[Any, str], list[Table]]
     """Makes its tables of what was found, with titles that name robot, sensing tier and mode."""
     values: Callable[[Any], dict[str, Any]]
     """Makes what stands in its JSON file of what was found."""
+    compares: bool = False
+    """Whether it compares the controllers, so that the user's take part."""
 
 
 PARTS = [
-    Part("table", mission_suite.drive, mission_suite.tables, mission_suite.values),
-    Part("reactive", reactive_corridors.drive, reactive_corridors.tables, reactive_corridors.values),
+    Part("table", mission_suite.drive, mission_suite.tables, mission_suite.values, compares=True),
+    Part("reactive", reactive_corridors.drive, reactive_corridors.tables, reactive_corridors.values, compares=True),
     Part("mppi", three_mppis.drive, three_mppis.tables, three_mppis.values),
     Part("limits", learned_limits.drive, learned_limits.tables, learned_limits.values),
 ]
 
 
-def suite(base: Scenario, mode: Mode, out: Path, scheduler: str | None = None) -> Iterator[str]:
+def suite(
+    base: Scenario, mode: Mode, out: Path, scheduler: str | None = None, controllers: Sequence[str] = ()
+) -> Iterator[str]:
     """Drives all parts; writes the tables of each in Markdown and JSON, and goes on where it was stopped.
 
     Args:
@@ -46,20 +51,23 @@ def suite(base: Scenario, mode: Mode, out: Path, scheduler: str | None = None) -
         mode: Which suite.
         out: Folder.
         scheduler: Address of a Dask scheduler to use; by default all cores of this machine are used.
+        controllers: Controllers of the user to compare, each as for `mrctl.loop.user_files.behind`.
 
     Yields:
         The tables of each part in Markdown, when it has ended.
 
     Raises:
-        InputError: The folder cannot be written or holds other results, the robot finds no way through most worlds, no
-            scheduler answers, its workers have other code or another robot, or a part fails there.
+        InputError: A controller is bad, the folder cannot be written or holds other results, the robot finds no way
+            through most worlds, no scheduler answers, its workers have other code or another robot, or a part fails
+            there.
     """
+    compared = mission_suite.contenders(base, controllers)
     source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     shown = f"{base.robot.path}, {base.sensing.tier}, {mode}"
     for part in PARTS:
         with output_folder(out):
             journal = Journal(out / f"{part.files}.jsonl", source, scheduler, partial(model_of, base))
-            found = part.drive(base, mode, journal)
+            found = part.drive(base, mode, *([compared] if part.compares else []), journal)
         text = "\n".join(table.markdown for table in part.tables(found, shown))
         (out / f"{part.files}.md").write_text(text, "utf-8")
         where = machine() if scheduler is None else {"processor": "a Dask cluster", "cores": journal.cores}

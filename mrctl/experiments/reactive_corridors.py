@@ -19,14 +19,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mrctl.control.stages import Stages
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import (
-    CONTROLLERS,
     CRITICAL_SHARE,
     PLAN_MARGINS,
     PLANTS,
+    RIVALS,
     ROOMY_FACTOR,
     SHAPE,
+    Contender,
     Mode,
     against,
     drawn,
@@ -43,7 +45,7 @@ from mrctl.navigation.planning import PATIENCE, prepared
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
+from mrctl.scenario import Scenario, replicates
 from mrctl.theory.perturbation import Perturbation
 
 ROOMS = (0.06, 0.09, 0.12, 0.15, 0.18, 0.24, 0.3)  # m, by which a corridor is wider than the robot; chosen
@@ -70,14 +72,18 @@ class Found(NamedTuple):
     """Widths that the draws need in m, infinite where even the widest is too narrow, `(controllers, plants, draws)`."""
     width: float
     """Width of the robot in m."""
+    controllers: Sequence[str]
+    """Names of the controllers, among them `none` and `model`."""
 
 
-def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
+def drive(base: Scenario, mode: Mode, compared: Sequence[Contender], journal: Journal) -> Found:
     """Drives all draws with all controllers on all plants; says first how long that takes.
 
     Args:
         base: Robot, steering, sensing and all else that is the same for all.
         mode: Which suite.
+        compared: The controllers; those with a motion controller of the user, in whose place the dynamic window drives,
+            are left out.
         journal: What was driven already, by controller and plant, which is kept there.
 
     Raises:
@@ -85,14 +91,16 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     """
     complaint = f"suite: {base.robot.path} finds no way through most corridors"
     draws = drawn(partial(draw, base), DRAWS[mode], complaint)
-    cases = list(product(CONTROLLERS, PLANTS))
-    left = sum([*case] not in journal for case in cases)
+    compared = [one for one in compared if "motion" not in one.stages()]
+    cases = list(product(compared, PLANTS))
+    left = sum([one.key, plant] not in journal for one, plant in cases)
     simulated = left * TRIES * PLANNED_TIMES * sum(one.scenario.reference.period for one in draws)
     expected = journal.expected(simulated / SIMULATED_PER_SECOND, len(cases))
     print(f"{left * TRIES * len(draws):,} runs with the dynamic window, {expected}", flush=True)
-    drives = [Computation([*case], partial(_driven, draws, case[0], PLANTS[case[1]])) for case in cases]
+    drives = [Computation([one.key, plant], partial(_driven, draws, one, PLANTS[plant])) for one, plant in cases]
     needed = np.array(list(journal.results(drives)), float)
-    return Found(needed.reshape(len(CONTROLLERS), len(PLANTS), -1), draws[0].width)
+    names = [one.name for one in compared]
+    return Found(needed.reshape(len(compared), len(PLANTS), -1), draws[0].width, names)
 
 
 def draw(base: Scenario, seed: int) -> Draw | None:
@@ -116,35 +124,37 @@ def draw(base: Scenario, seed: int) -> Draw | None:
     return None
 
 
-def _driven(draws: Sequence[Draw], controller: FeedforwardName, plant: Perturbation) -> list[float]:
+def _driven(draws: Sequence[Draw], contender: Contender, plant: Perturbation) -> list[float]:
     """Drives all draws with one controller on one plant; returns the widths that they need in m, as in `Found`."""
-    changes = {**FEEDFORWARDS[controller], "perturbation": plant}
+    changes, stages = {**contender.choice.pair, "perturbation": plant}, contender.stages()
 
     def needed(one: Draw) -> float:
-        first = bisect_left(ROOMS, True, key=lambda room: passes(one, one.width + room, changes))
+        first = bisect_left(ROOMS, True, key=lambda room: passes(one, one.width + room, changes, stages))
         return one.width + ROOMS[first] if first < len(ROOMS) else np.inf
 
     return [needed(one) for one in draws]
 
 
-def passes(one: Draw, width: float, changes: dict[str, Any]) -> bool:
+def passes(one: Draw, width: float, changes: dict[str, Any], stages: Stages) -> bool:
     """Tells whether a robot arrives through a corridor.
 
     Args:
         one: The draw.
         width: Width of the corridor in m.
         changes: What replaces the velocity controller and the robot of its scenario.
+        stages: The user's stages, but for a motion controller.
     """
     walls, goal = corridor(width, one.seed, **SHAPE).obstacles, one.scenario.goal
     assert goal is not None
     (own,) = replicates(one.scenario.replace(obstacles=walls, **changes), 1, one.seed)
-    run = simulate([own], threads=1, motion=avoiding("window")).isel(run=0)
+    drives: Stages = {**stages, "motion": avoiding("window")}
+    run = simulate([own], threads=1, **drives).isel(run=0)
     return reached(run.dropna("time", subset=["x"]), goal)
 
 
 def values(found: Found) -> dict[str, Any]:
     """Returns what was found for JSON."""
-    return {"controllers": CONTROLLERS, "plants": list(PLANTS), "rooms": ROOMS} | {
+    return {"controllers": found.controllers, "plants": list(PLANTS), "rooms": ROOMS} | {
         "robot_width": found.width,
         "widths": found.needed.tolist(),
     }
@@ -154,14 +164,14 @@ def tables(found: Found, shown: str) -> list[Table]:
     """Returns the table of the critical widths in reactive mode; its title says what is `shown`."""
     rows = []
     for plant, own in zip(PLANTS, found.needed.swapaxes(0, 1), strict=True):
-        for name, one in zip(CONTROLLERS, own, strict=True):
+        for name, one in zip(found.controllers, own, strict=True):
             through = [int((one <= found.width + room + 1e-9).sum()) for room in ROOMS]
             shares = " / ".join(f"{count / len(one):.2f}" for count in through)
             rows.append(
                 [plant, titled(name), share_cell(through[-1], len(one)), critical_cell(found.width, one), shares]
             )
-            for rival in ("none", "model"):
-                wins = superiority(one, own[CONTROLLERS.index(rival)])
+            for rival in RIVALS:
+                wins = superiority(one, own[found.controllers.index(rival)])
                 rows[-1].append("" if rival == name else wins_cell(wins))
     header = ["plant", "controller", "through the widest", "critical width, mm", "success at each width"]
     header += ["needs less than PID", "less than model"]
@@ -169,8 +179,7 @@ def tables(found: Found, shown: str) -> list[Table]:
     says = (
         f"With the dynamic window, which sees the walls on its map, a robot of {1e3 * found.width:.0f} mm drives "
         f"corridors of {widths} mm. The interval of a critical width reaches down to the width tried before. In paired "
-        f"draws, with 95 % confidence: {against('none', found.needed, 0)}; "
-        f"{against('model', found.needed, 0)}."
+        f"draws, with 95 % confidence: {against(found.controllers, found.needed, 0)}."
     )
     return [Table(f"Critical width of a corridor in reactive mode ({shown})", says, frame(rows, header))]
 

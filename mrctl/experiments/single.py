@@ -17,7 +17,6 @@ from mrctl.loop.hierarchy import MAX_LEARNING_SLIP
 from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.learned import save_learned
 from mrctl.loop.runs import simulate
-from mrctl.loop.user_stages import named_stages
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.dataset import departure, faults_of, save, scenarios_of, versions
@@ -65,7 +64,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
     """
     with output_folder(out, () if out is None else _written()):
-        result = best_fixed([scenario]) if hindsight else _driven(scenario, own)
+        stages: Stages = user_files.load(own) if own else {}
+        result = best_fixed([scenario]) if hindsight else simulate([scenario], progress=True, **stages)
     return _report(scenario, result, out, as_json, own)
 
 
@@ -89,19 +89,9 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
         scenarios = scenarios_of(saved)
         if len(scenarios) != 1:
             raise InputError(f"{folder}: holds {len(scenarios)} runs; mrctl run repeats a single one")
-        drove = json.loads(saved.attrs.get("stages", "{}"))
-        given = named_stages(user_files.load(own)) if own else {}
-        if drove != given:
-            names = ", ".join(f"{stage}={name}" for stage, name in drove.items())
-            with_them = f"--controller with {names}" if names else "no --controller"
-            raise InputError(f"controller: the run in {folder} needs {with_them}, as when it was saved")
-        result = _driven(scenarios[0], own)
+        stages = user_files.load_same(own, json.loads(saved.attrs.get("stages", "{}")), folder)
+        result = simulate(scenarios, progress=True, **stages)
     return _report(scenarios[0], result, out, as_json, own), departure(result, saved)
-
-
-def _driven(scenario: Scenario, own: str | None) -> xr.Dataset:
-    stages: Stages = user_files.load(own) if own else {}
-    return simulate([scenario], progress=True, **stages)
 
 
 def _report(scenario: Scenario, result: xr.Dataset, out: Path | None, as_json: bool, own: str | None) -> Report:

@@ -24,18 +24,17 @@ from mrctl.experiments.cases import (
     SUITE_SEEDS,
     UNCHANGED,
     Case,
-    Choice,
     Choices,
     Entry,
     Laps,
     Mode,
     Outcome,
+    by_name,
     cases,
 )
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables, titled
 from mrctl.experiments.tables import machine, output_folder, write_json
 from mrctl.kernel import Array
-from mrctl.loop import user_files
 from mrctl.loop.groups import cores
 from mrctl.loop.hindsight import REPETITIONS
 from mrctl.loop.runs import simulate
@@ -43,7 +42,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
-from mrctl.scenario import FEEDFORWARDS, Scenario, feedforward_name, replicates
+from mrctl.scenario import Scenario, replicates
 from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 from mrctl.sweep.store import Store
@@ -103,29 +102,6 @@ def suite(
     write_json(out / "table.json", found | {"rows": rows, "runs": each_run(runs)})
     report.write(outcome, choices, shown, out)
     return outcome
-
-
-def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str]) -> Choices:
-    """Returns what drives the runs, by the name of the feedforward or of the user's class.
-
-    Args:
-        feedforwards: Names of feedforwards of mrctl.
-        controllers: Controllers of the user, each as for `mrctl.loop.user_files.behind`: with a feedforward of mrctl in
-            front, as in `model+composite+motion=my_file.py:MyMotion`, or without one.
-
-    Raises:
-        InputError: A controller is bad, or its name is taken.
-    """
-    choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
-    for entry in controllers:
-        front, stages, parts = user_files.behind(entry)
-        name = feedforward_name(front, "+".join(part.title for part in parts))
-        if name in choices:
-            raise InputError(f"controller: the name {name} is taken")
-        own = user_files.absolute(stages)
-        user_files.trial(own, Scenario(laps=1, **FEEDFORWARDS[front]))
-        choices[name] = Choice(**FEEDFORWARDS[front], controller=own)
-    return choices
 
 
 def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path) -> tuple[Laps, str]:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop.simulation import Simulation
-from mrctl.loop.user_stages import StageError
+from mrctl.loop.user_stages import StageError, named_stages
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
@@ -250,6 +250,25 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
         factory = partial(factory, **part.settings)
         factory.__name__ = part.title  # type: ignore[attr-defined] (the name in labels and messages)
     return factory
+
+
+def load_same(name: str | None, drove: Mapping[str, str], source: Path) -> Stages:
+    """Runs the files of the stages that drove a saved run, which holds their names alone; returns them as `load` does.
+
+    Args:
+        name: What the user says has driven it; None for nothing.
+        drove: Names of the factories that drove it, by stage.
+        source: Where the run was saved, for messages.
+
+    Raises:
+        InputError: The name is refused, as by `load`, or other stages drove the run.
+    """
+    stages: Stages = load(name) if name else {}
+    if named_stages(stages) != drove:
+        names = ", ".join(f"{stage}={factory}" for stage, factory in drove.items())
+        needed = f"--controller with {names}" if names else "no --controller"
+        raise InputError(f"controller: the run in {source} needs {needed}, as when it was saved")
+    return stages
 
 
 def without_learned(name: str, scenario: Scenario) -> Scenario:

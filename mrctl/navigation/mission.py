@@ -6,12 +6,13 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from mrctl.control.stages import Stages
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.runs import simulate
@@ -20,6 +21,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.plan import Plan
 from mrctl.navigation.planning import PLAN_MARGIN, Avoid, prepared
 from mrctl.record import InputError, Record, read_file
+from mrctl.results.dataset import combine
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.obstacles import Pose
@@ -42,7 +44,7 @@ class Mission(NamedTuple):
 
 
 class Order(Record):
-    """All that a mission is a function of, but for the files that it names, such as that of a robot.
+    """All that a mission is a function of, but for the files that it names, such as that of a robot, and own stages.
 
     With the same files and versions of the packages, the same order gives the same bits.
 
@@ -62,9 +64,9 @@ class Order(Record):
     avoid: Avoid = "none"
     """Law that keeps the robot from obstacles that its map does not have."""
 
-    def drive(self, progress: bool = False) -> Mission:
+    def drive(self, progress: bool = False, **stages: Unpack[Stages]) -> Mission:
         """Drives the mission; see `navigate`."""
-        return navigate(**{name: getattr(self, name) for name in type(self).model_fields}, progress=progress)
+        return navigate(**{name: getattr(self, name) for name in type(self).model_fields}, progress=progress, **stages)
 
 
 def order_of(folder: str | Path) -> Order:
@@ -87,9 +89,12 @@ def order_of(folder: str | Path) -> Order:
     return Order.from_dict({name: known[name] for name in Order.model_fields if name in known}, str(path))
 
 
-def again(folder: str | Path, progress: bool = False) -> Mission:
-    """Drives a saved mission again, with the same bits; arguments and errors are those of `order_of` and `navigate`."""
-    return order_of(folder).drive(progress)
+def again(folder: str | Path, progress: bool = False, **stages: Unpack[Stages]) -> Mission:
+    """Drives a saved mission again, with the same bits; arguments and errors are those of `order_of` and `navigate`.
+
+    A mission that stages of the user drove needs the same ones.
+    """
+    return order_of(folder).drive(progress, **stages)
 
 
 def navigate(
@@ -100,6 +105,7 @@ def navigate(
     margin: float = PLAN_MARGIN,
     avoid: Avoid = "none",
     progress: bool = False,
+    **stages: Unpack[Stages],
 ) -> Mission:
     """Plans a way among the obstacles on the map, and drives it with the hierarchy.
 
@@ -111,7 +117,7 @@ def navigate(
         scenario: The robot and all else. Reference, laps, goal, obstacles, map and initial pose are those of the
             mission; with `window` and `mppi` the motion period is the multiple of the control period that is
             nearest to 0.05 s, and the prefilter, unless set, the shortest.
-        compare: Feedforwards of further robots, which drive the same plan, each alone.
+        compare: Feedforwards of further robots, which drive the same plan, each alone, without `stages`.
         speed: Largest speed in m/s; by default 0.9 of the robot's. With an avoider it is at most that
             from which it can stop within sight (`mrctl.navigation.planning.prepared`).
         margin: Clearance that the plan keeps in m.
@@ -119,25 +125,45 @@ def navigate(
             so that it follows the plan in time (`none`), a filter that slows the time of the plan (`barrier`), or a
             motion stage that goes along the plan at its own pace (`window`, `mppi`).
         progress: Whether to show a progress bar.
+        stages: The user's stages, as in `simulate`, of the first robot. A motion controller of the user is in the place
+            of an avoider, so that it drives with `none` alone.
 
     Raises:
         InputError: The task is none, there is no such feedforward or avoider, the margin or the speed is out of range,
             start or goal is within the margin of an obstacle or off the map, the robot is at its goal, there is no way,
-            or the robot cannot drive the plan or would touch an obstacle on it.
+            the robot cannot drive the plan or would touch an obstacle on it, or a stage is refused, as in `simulate`.
     """
     if not isinstance(task, Task):
         raise InputError(f"task: must be a world with start and goal, such as `task_of` makes, not {task!r:.60}")
     for name in compare:
         if name not in FEEDFORWARDS:
             raise InputError(f"compare: {name!r} is none of {', '.join(FEEDFORWARDS)}")
+    if avoid != "none" and stages.get("motion"):
+        raise InputError(
+            f"motion: your own motion controller cannot drive beside {avoid}, which is one; set avoid to none"
+        )
     began = perf_counter()
     found, own = prepared(task, scenario, speed, margin, avoid)
     planning_time = perf_counter() - began
     others = [own.with_feedforward(name) for name in compare]
-    result = simulate([own, *others], progress=progress, motion=avoiding(avoid))
+    result = _driven(own, others, avoid, progress, stages)
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven.max(initial=0)) + 1))
     return Mission(found, result, outcomes(result, task.goal, found), planning_time)
+
+
+def _driven(own: Scenario, others: list[Scenario], avoid: Avoid, progress: bool, stages: Stages) -> xr.Dataset:
+    """Drives the first robot, with the user's stages, and the others, without them."""
+    avoider: Stages = {"motion": avoiding(avoid)} if avoid != "none" else {}
+    if not any(stages.values()):
+        return simulate([own, *others], progress=progress, **avoider)
+    first = simulate([own], progress=progress, **(stages | avoider))
+    if not others:
+        return first
+    rest = simulate(others, progress=progress, **avoider)
+    whole = combine([([0], first), (range(1, 1 + len(others)), rest)], [own, *others])
+    whole.attrs["stages"] = first.attrs["stages"]
+    return whole
 
 
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:

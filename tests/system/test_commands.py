@@ -355,10 +355,6 @@ def test_bad_scenario_is_one_line(
         (["navigate", "doorway:1", "--sensing.lidar.nois", "3"], "did you mean --sensing.lidar.noise?"),
         (["run", "--lapz=3"], "no flag is called --lapz"),
         (["run", "--pertubation", "all"], "no flag is called --pertubation; did you mean --perturbation?"),
-        (
-            ["navigate", "doorway:1", "--controller", "a.py:A"],
-            "controller: a mission of this command drives with those",
-        ),
         (["view", "--controller=a.py:A"], "controller: a live session drives with those of mrctl; with your own, give"),
         (["run", "--out"], "out: needs a value; see mrctl run --help"),
         (["sweep"], "SWEEP.toml, --out PATH: missing; see mrctl sweep --help"),

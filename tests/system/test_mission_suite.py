@@ -18,17 +18,36 @@ import mrctl.experiments.reactive_corridors as reactive
 import mrctl.experiments.three_mppis as three
 import mrctl.navigation.mppi as mppi
 from mrctl import Lemniscate, Perturbation, Scenario, cli, simulate
+from mrctl.experiments.cases import Choice
 from mrctl.experiments.navigation_suite import PARTS
 from mrctl.navigation.generators import bent_line, corridor, corridor_width
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
+from mrctl.record import InputError
 from mrctl.sweep.pool import JobOutcome, Work
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.timing import Limits
 
 HULL = footprint(mjcf.load())
+PID = suite.Contender("none", Choice())
+ZERO = """
+import numpy as np
+
+class Zero:
+    def __init__(self, robot, size): ...
+    def output(self, command, derivative): return np.zeros_like(command)
+    def learn(self, feedback, frozen, twist, voltage): ...
+"""
+MOVES = """
+import numpy as np
+
+class Stay:
+    def __init__(self, robot, size): ...
+    def reset(self, pose, reference, period): ...
+    def output(self, pose, twist, reference): return np.zeros((len(pose), 2))
+"""
 
 
 class Here:
@@ -97,8 +116,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.setattr(suite, "SPEEDS", (0.6, 0.9))
     for part in (suite, reactive, three):
         monkeypatch.setattr(part, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
-    for part in (suite, reactive):
-        monkeypatch.setattr(part, "CONTROLLERS", ("none", "model"))
+    monkeypatch.setattr(suite, "CONTROLLERS", ("none", "model"))
     monkeypatch.setattr(three, "WORLDS", {"quick": 1})
     for part in (reactive, feeding):
         monkeypatch.setattr(part, "DRAWS", {"quick": 1})
@@ -145,6 +163,28 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert printed.startswith("12 runs, about") and "\n2 runs with MPPI" in printed
     assert "\n3 runs with the dynamic window" in printed and "\n3 runs with nominal" in printed
     assert {name: (tmp_path / name).read_bytes() for name in first} == first
+    # A controller of the user joins in the same folder: only its runs are driven, and again after an edit of its file.
+    # One that adds nothing needs what PID alone needs. Where the window is the motion controller, none joins.
+    own, moves = tmp_path / "zero.py", tmp_path / "moves.py"
+    own.write_text(ZERO)
+    moves.write_text(MOVES)
+    joined = ["navigate", "--suite", "--quick", "--out", str(tmp_path), "--controller", f"{own}:Zero"]
+    assert cli.main([*joined, f"model+motion={moves}:Stay"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("18 runs, about") and "\n3 runs with the dynamic window" in printed
+    assert "\n0 runs with MPPI" in printed and "\n0 runs with nominal" in printed
+    values = json.loads((tmp_path / "table.json").read_text())
+    assert values["controllers"] == ["none", "model", "Zero", "model+Stay"]
+    needed = np.array(values["needed"], float)
+    assert np.array_equal(needed[:, 2], needed[:, 0]) and np.isnan(needed[:, 3]).all()  # null: infinite
+    assert re.search(r"\| nominal +\| model\+Stay +\| 0/3 ", printed) and "| nominal | Zero" in printed
+    values = json.loads((tmp_path / "reactive.json").read_text())
+    assert values["controllers"] == ["none", "model", "Zero"] and values["widths"][2] == values["widths"][0]
+    own.write_text(ZERO + "# edited\n")
+    assert cli.main(joined) == 0
+    assert capsys.readouterr().out.startswith("9 runs, about")
+    assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
+    assert {name: (tmp_path / name).read_bytes() for name in first} == first
     for part in (suite, reactive, three, feeding):
         monkeypatch.setattr(part, "simulate", None)
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
@@ -160,15 +200,27 @@ def test_width_by_bisection(monkeypatch: pytest.MonkeyPatch) -> None:
     one, tried = reactive.Draw(0, Scenario(), 0.4), []
     for least in (0.0, *reactive.ROOMS, 1.0):
 
-        def passes(_: object, width: float, __: object, least: float = least) -> bool:
+        def passes(_: object, width: float, *__: object, least: float = least) -> bool:
             tried[-1] += 1
             return width > 0.4 + least - 1e-9
 
         tried.append(0)
         monkeypatch.setattr(reactive, "passes", passes)
-        (found,) = reactive._driven([one], "none", Perturbation())
+        (found,) = reactive._driven([one], PID, Perturbation())
         assert found == min((0.4 + room for room in reactive.ROOMS if room >= least), default=np.inf)
     assert set(tried) == {reactive.TRIES}
+
+
+def test_changed_controller(tmp_path: Path) -> None:
+    """A worker refuses a controller whose file was edited since the suite began."""
+    own = tmp_path / "zero.py"
+    own.write_text(ZERO)
+    *_, one = suite.contenders(Scenario(), [f"model+{own}:Zero"])
+    assert one.name == "model+Zero" and one.choice.pair == {"prior": "model", "learner": "none"}
+    assert list(one.stages()) == ["feedforward"]
+    own.write_text(ZERO + "# edited\n")
+    with pytest.raises(InputError, match=r"^controller: .*zero\.py:Zero.* is not as it was when the suite began$"):
+        one.stages()
 
 
 def test_critical_cell() -> None:
@@ -182,8 +234,8 @@ def test_narrow_corridor_in_reactive_mode() -> None:
     """A robot passes a corridor that is 30 cm wider than itself, and none that is narrower than itself."""
     one = reactive.draw(Scenario(), 0)
     assert one is not None and one.width == pytest.approx(np.ptp(HULL[:, 1]))
-    assert reactive.passes(one, one.width + 0.3, {"learner": "none"})
-    assert not reactive.passes(one, one.width + 0.005, {"learner": "none"})
+    assert reactive.passes(one, one.width + 0.3, {"learner": "none"}, {})
+    assert not reactive.passes(one, one.width + 0.005, {"learner": "none"}, {})
 
 
 def test_ties_of_critical_speeds() -> None:
@@ -192,7 +244,7 @@ def test_ties_of_critical_speeds() -> None:
     needed = np.zeros((2, *size))
     needed[1] = 1.0
     needed[1, suite.CONTROLLERS.index("fel")] = 0.0  # it alone passes at the larger speed too
-    found = suite.Found(needed, *(np.zeros(size) for _ in range(3)), np.zeros(10), [0.5, 0.5005], 0)
+    found = suite.Found(needed, *(np.zeros(size) for _ in range(3)), np.zeros(10), [0.5, 0.5005], 0, suite.CONTROLLERS)
     listed = ", ".join(f"`fel` ({plant})" for plant in suite.PLANTS)
     says = suite.critical_speeds(found, "car").says
     assert f"better than `PID` are {listed}; better than `model` are {listed}." in says
@@ -204,10 +256,11 @@ def test_budget_of_none() -> None:
     """Who arrives in fewer than 95 % of the draws has no budget; where nobody has one, the sentence says so."""
     size = len(suite.CONTROLLERS), len(suite.PLANTS), 20
     needed = np.where(np.arange(20) < 2, np.inf, 0.6) * np.ones(size)
-    found = suite.Found(needed[None], *(needed for _ in range(3)), np.full(20, 0.5), [0.5], 0)
+    found = suite.Found(needed[None], *(needed for _ in range(3)), np.full(20, 0.5), [0.5], 0, suite.CONTROLLERS)
     says = suite.budget(found, "car").says
     assert says == "On the nominal plant no controller has a finite allowance with each of these maps and estimates."
-    found = suite.Found(needed[None, ..., 2:], *(needed[..., 2:] for _ in range(3)), np.full(18, 0.5), [0.5], 0)
+    rest = needed[..., 2:]
+    found = suite.Found(rest[None], *(rest for _ in range(3)), np.full(18, 0.5), [0.5], 0, suite.CONTROLLERS)
     assert "third: `PID` 0.0, 0.0, 0.0; `model`" in suite.budget(found, "car").says
 
 

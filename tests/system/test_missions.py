@@ -23,6 +23,17 @@ from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import cover
 
 PID = Scenario(learner="none")
+OWN = """
+class Half:
+    def __init__(self, robot, size): ...
+    def output(self, command, derivative): return 0.5 * command
+    def learn(self, feedback, frozen, twist, voltage): ...
+
+class Other(Half): ...
+
+class Broken(Half):
+    def __init__(self, robot, size): 1 / 0
+"""
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -91,6 +102,63 @@ def test_again(avoid: Avoid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     saved, driven = mrctl.open("drive/result.zarr"), again("drive")
     for name in ("x", "v", "omega_command", "voltage_left", "clearance", "weights"):
         assert driven.result[name].values.tobytes() == saved[name].values.tobytes()
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.parametrize("avoid", ["none", "window"])
+def test_own_controller(avoid: Avoid, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A user's controller drives the first robot alone; what is saved needs it again.
+
+    The robot drives as in `simulate`, and the one beside it as in a mission without it.
+    """
+    own, out = tmp_path / "own.py", tmp_path / "out"
+    own.write_text(OWN)
+    given, name = ["navigate", "doorway:3", "--avoid", avoid], f"model+{own}:Half"
+    assert cli.main([*given, "--controller", name, "--compare", "model", "none", "--out", str(out)]) == 0
+    printed, result = capsys.readouterr().out, mrctl.open(out / "result.zarr")
+    beside = "" if avoid == "none" else " + window"
+    assert result["label"].values.tolist() == [label + beside for label in ("model+Half", "model", "none")]
+    assert f"| model+Half{beside} " in printed and "| arrived |" in printed
+    robot = Scenario(prior="model", learner="none")
+    task = task_of("doorway:3", robot)
+    whole, (_, scenario) = navigate(task, robot, ["none"], avoid=avoid), prepared(task, robot, avoid=avoid)
+    namespace = {}
+    exec(OWN, namespace)  # noqa: S102
+    single = mrctl.simulate(scenario, motion=avoiding(avoid), feedforward=namespace["Half"])
+    for signal in ("x", "y", "voltage_left"):
+        ours = result[signal].dropna("time", how="all").values
+        assert np.array_equal(ours[1:, : whole.result.sizes["time"]], whole.result[signal].values, equal_nan=True)
+        alone = single[signal].dropna("time").values
+        assert np.array_equal(ours[0, : len(alone)], alone) and np.isnan(ours[0, len(alone) :]).all()
+        assert not np.array_equal(ours[0, :100], ours[1, :100])
+    assert cli.main(["navigate", str(out), "--controller", f"{own}:Half"]) == 0
+    assert f"{out}: bit-identical" in capsys.readouterr().out
+    needs = f"controller: the run in {out} needs --controller with feedforward=Half, as when it was saved"
+    assert needs in refused(capsys, "navigate", str(out))
+    assert needs in refused(capsys, "navigate", str(out), "--controller", f"{own}:Other")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--controller", "a.py:X", "b.py:Y"], "controller: a mission has one of yours; --suite compares several"),
+        (
+            ["--controller", "a.py:X", "--learner", "rls"],
+            "controller: a feedforward of mrctl stands in front of it,",
+        ),
+        (["--controller", "a.py:X", "--view"], "controller: a live session drives with those of mrctl; with your own,"),
+        (["--controller", "a.py:X"], "controller: no file a.py in "),
+        (["--controller", "motion=own.py:Half", "--avoid", "mppi"], "motion: your own motion controller cannot drive"),
+        (["--controller", "own.py:Broken"], "feedforward Broken: ZeroDivisionError: division by zero (own.py, line "),
+    ],
+)
+def test_own_controller_is_refused(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A controller that cannot drive a mission is refused in one line."""
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+    assert refused(capsys, "navigate", "doorway:3", *arguments).startswith(f"mrctl: {message}")
 
 
 @pytest.mark.usefixtures("no_figures")
