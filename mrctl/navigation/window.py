@@ -37,24 +37,26 @@ class Window(Reactive):
         rotations = last[1] + turn * ROTATION_SAMPLES * abs(ROTATION_SAMPLES)
         rotations = np.clip(rotations, -bounds.rotation, bounds.rotation)
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
-        constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
-        ahead, costs = np.empty((len(grid), LOOK_STEPS, 2)), np.empty(len(grid))
-        # A constant twist would rather stop before the goal than be turned there.
-        scene = scene._replace(end=STEPS, near=NEARNESS_WEIGHT)
-        near = scene._replace(targets=scene.targets[:LOOK_STEPS])
-        roll_out.compiled(
-            constant, rest[:LOOK_STEPS], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs
-        )
-        stops, braking, wide = np.empty((len(grid), STEPS, 2)), np.empty(len(grid)), np.empty(len(grid))
+        constant = np.repeat(grid, KNOTS, axis=1)
         falling = constant * np.array([1.0, *[0.0] * (KNOTS - 1)])[:, None]
         falling[:, :, 1] = constant[:, :, 1]  # the curvature bounds θ̇ as V falls
-        roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, scene, np.inf, stops, braking)
+
+        def rolled_out(knots: Array, scene: Scene) -> tuple[Array, Array]:
+            """Returns twists and costs of roll-outs that are as long as the targets of a scene."""
+            steps = len(scene.targets)
+            twists, costs = np.empty((len(knots), steps, 2)), np.empty(len(knots))
+            state = pose, twist, last, 0.0, period, bounds, scene
+            roll_out.compiled(knots, np.zeros((steps, 2)), *state, np.inf, twists, costs)
+            return twists, costs
+
+        # A constant twist would rather stop before the goal than be turned there.
+        scene = scene._replace(end=STEPS, near=NEARNESS_WEIGHT)
+        ahead, costs = rolled_out(constant, scene._replace(targets=scene.targets[:LOOK_STEPS]))
+        stops, braking = rolled_out(falling, scene)
         costs[braking >= TOUCH_COST] = np.inf
         if len(scene.movers):
-            off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, UNMAPPED_TWIST_MARGIN]))
-            # The twists of a roll-out do not depend on the scene: `stops` stays as it is.
-            roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, off, np.inf, stops, wide)
-            costs[wide >= TOUCH_COST] += TOUCH_COST
+            wide = scene.movers + np.array([0.0, 0.0, 0.0, 0.0, UNMAPPED_TWIST_MARGIN])
+            costs[rolled_out(falling, scene._replace(movers=wide))[1] >= TOUCH_COST] += TOUCH_COST
         best = int(costs.argmin())
         hard = np.where(grid[:, 0, 0] == speeds[0], braking, np.inf)
         chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(hard.argmin())]
