@@ -117,6 +117,7 @@ def _as_json(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
         "guard": metrics.guard_events(run).drop(columns="run").to_dict("records"),
         "retuned": _retuned(run),
         "feedforward_limited": _limited(run),
+        "notes": _notes(scenario, run),
     }
     return json_text(values)
 
@@ -138,8 +139,7 @@ def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
         f"steering {run['steering'].values}"
     ]
     lines += [f"failed {failure}"] if failure else []
-    lines += faults_of(run) + _limited(run) + _unreached(scenario, run)
-    lines += _taken_back(scenario, run) + _slipped(scenario, run)
+    lines += faults_of(run) + _limited(run) + _notes(scenario, run)
     rows = [
         [str(k + 1), *(_cell(name, scale * float(laps[name].values[k])) for name, (_, scale) in COLUMNS.items())]
         for k in np.flatnonzero(np.isfinite(laps["position_rmse"].values))
@@ -154,6 +154,11 @@ def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
 def _cell(name: str, value: float) -> str:
     """Returns a metric as text; what is counted is a whole number."""
     return f"{value:.0f}" if name == "guard_actions" else number(value)
+
+
+def _notes(scenario: Scenario, run: xr.Dataset) -> list[str]:
+    """Says what a user may not have meant: an event or a goal without effect, and what kept a learner from learning."""
+    return _unreached(scenario, run) + _taken_back(scenario, run) + _slipped(scenario, run)
 
 
 def _taken_back(scenario: Scenario, run: xr.Dataset) -> list[str]:

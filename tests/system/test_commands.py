@@ -128,6 +128,8 @@ def test_event_that_takes_back(tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert cli.main(["run", str(tmp_path / "run.toml")]) == 0
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("event")]
     assert said == ["event at 0.5 s: mass_factor goes back to 1"]
+    assert cli.main(["run", str(tmp_path / "run.toml"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == said
 
 
 @pytest.mark.parametrize(("learner", "says"), [("rls", True), ("indi", False), ("none", False)])
