@@ -5,7 +5,8 @@ the same draws. A plan keeps as far from the walls as it can. The robots follow 
 run in the open shows how wide the corridor must be for them to touch none: a run that ends at its goal needs that
 width, and any other an infinite one. The critical width is what 95 % of the draws need at most, at the largest speed.
 The allowance is what 95 % of them need at most beyond the widths of their plans, which perfect tracking needs. The
-critical speed is the largest at which, and at all slower ones, 95 % of the draws need no more than a given allowance.
+critical speed is the largest that 95 % of the draws reach; a draw reaches a speed if at it, and at all slower ones, it
+needs no more than a given allowance.
 
 The error budget of the allowance takes away the error of the map, on which the corridor is drawn `MAP_ERROR` beside its
 place (one standard deviation), and then that of the estimate or that of tracking.

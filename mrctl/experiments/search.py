@@ -443,7 +443,11 @@ def text(table: dict[str, Any]) -> str:
         markdown(["tier", "shipped", "found"], trained),
         f"The same in {table['budget']['fresh']} fresh worlds, with 95 % intervals:",
         markdown(["tier", "settings", "over model", "over shipped", "failed"], fresh),
-        *(f"What was found in {tier} is no better there than the shipped settings." for tier in tiers if level(tier)),
+        *(
+            f"What was found in {tier} is not shown to be better there than the shipped settings."
+            for tier in tiers
+            if level(tier)
+        ),
         "\n".join(f"mrctl run --sensing.tier {tier} {found['flags']}" for tier, found in tiers.items()),
     ]
     return "\n\n".join(parts)

@@ -33,14 +33,14 @@ from mrctl.experiments.cases import (
     cases,
 )
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables, titled
-from mrctl.experiments.tables import machine, output_folder, write_json
+from mrctl.experiments.tables import MIN_PAIRS, machine, output_folder, write_json
 from mrctl.kernel import Array
 from mrctl.loop.groups import cores
 from mrctl.loop.hindsight import REPETITIONS
 from mrctl.loop.runs import simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
-from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
+from mrctl.results.comparison import TIE, bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario, replicates
 from mrctl.sweep import jobs, store
@@ -203,7 +203,7 @@ def _row(
     own, lost = ends[name], ends[name]["failed"].values.astype(bool)
     row: dict[str, Any] = {"part": case.part, "case": case.name, "feedforward": name}
     row |= {"runs": len(lost), "failed": int(lost.sum())}
-    row["guard_events"] = float(own["guard_actions"].sum("lap").mean())
+    row["guard_events"] = float(own["guard_actions"].sum("lap", skipna=False).mean())  # of the runs that finished
     if "none" in ends:
         row["failed_where_pid_did_not"] = int((lost & ~ends["none"]["failed"].values.astype(bool)).sum())
     for metric in COLUMNS:
@@ -290,7 +290,8 @@ class Floor(NamedTuple):
     """Largest change of a difference between two means, in which a change that all means share cancels."""
     tie: float
     """Largest difference of two errors in a run that counts as a tie: at least `difference`, and so much that the
-    paired test finds no change of any difference when the step is halved."""
+    paired test finds no change of any difference when the step is halved. So few runs that the test could find none
+    have the `TIE` of `mrctl.results.comparison`."""
 
 
 def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
@@ -313,6 +314,7 @@ def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
                 means = np.mean(changes, axis=1)
                 difference = max(floor.difference, float(np.ptp(means)))
                 ties = [unnoticed(one - other) for one, other in combinations(changes, 2)]
+                ties += [TIE[metric]] if len(changes[0]) < MIN_PAIRS else []
                 mean = max(floor.mean, float(np.abs(means).max()))
                 found[window] = Floor(mean, difference, max(floor.tie, difference, *ties))
     return found

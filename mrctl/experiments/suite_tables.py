@@ -39,10 +39,10 @@ CONVERGED = f"laps to {RECOVERED_RATIO:g}× the final V / θ̇ / position"
 READING_OF_POSITIONS = (
     "Lap 1, all laps and the last lap each hold the mean over the runs that drove all of it, for random worlds the "
     "median, with its 95 % interval. Less `model` is the mean of the differences from `model`, run by run, for random "
-    "worlds their median, or a tie where the sign test does not tell the two apart. Regret is not paired: it is the "
-    "mean over all laps less that of `hindsight`, for random worlds a difference of two medians, each over the runs "
-    "that finished with that feedforward, or a tie up to the floor of differences. Excess is a mean over the runs "
-    "that finished, for random worlds too."
+    "worlds their median, or a tie where the sign test does not tell the two apart; where it has the other sign than "
+    "in most runs, that is said. Regret is not paired: it is the mean over all laps less that of `hindsight`, for "
+    "random worlds a difference of two medians, each over the runs that finished with that feedforward, or a tie up to "
+    "the floor of differences. Excess is a mean over the runs that finished, for random worlds too."
 )
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
 
@@ -165,7 +165,7 @@ def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
     cells = [
         [
             row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
-            *(_wins(row, titled(one)) for one in YARDSTICKS), number(row["guard_events"]),
+            *(_wins(row, titled(one)) for one in YARDSTICKS), _acted(row),
             *(_harm(row) if random else ()), *([_converged(row)] if unchanged else []),
         ]
         for row in rows
@@ -182,7 +182,8 @@ def reading(header: Sequence[str]) -> str:
         "Below PID, or below `model`, is the share of runs in which the error of the last lap is less than that of PID "
         "alone, or of `model`, in the same run: 1.00 is all runs, 0.50 is no difference, a tie counts half, and a "
         "failed run loses. The three shares are those for V, θ̇ and position; the brackets hold the "
-        "95 % interval of the share for position, given the ties. Guard acted is the mean number of times in a run."
+        "95 % interval of the share for position, given the ties. Guard acted is the mean number of times in a run "
+        "that finished."
     ]
     if HARMLESS in header:
         found.append(
@@ -210,7 +211,9 @@ def positions(rows: Sequence[Row]) -> pd.DataFrame:
         regret = 1e3 * (error["all"]["value"] - known.get(row["case"], np.nan))
         tie = abs(regret) <= 1e3 * error["all"]["floor"]["difference"]
         excess = error.get("excess", {"samples": 0})
-        cells.append([row["case"], row["feedforward"], *(interval(_window(error, window)) for window in WINDOWS)])
+        lost = f" ({row['failed']}/{row['runs']} lost)" if row["failed"] else ""
+        name = row["feedforward"] + lost
+        cells.append([row["case"], name, *(interval(_window(error, window)) for window in WINDOWS)])
         cells[-1].append(" / ".join(_less(row, window) for window in WINDOWS) if "less_model" in error else "")
         cells[-1].append(("tie" if tie else _signed(regret)) if np.isfinite(regret) else "")
         cells[-1].append(number(1e3 * excess["value"]) if excess["samples"] else "–")
@@ -219,11 +222,11 @@ def positions(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def leaders(rows: Sequence[Row]) -> list[list[str]]:
-    """Finds, for each case and column of `LEADING`, the feedforward with the least mean, and those level with it.
+    """Finds, for each case and column of `LEADING`, the best feedforward and those level with it.
 
-    A feedforward is level if the best does not beat it with 95 % confidence in the same runs. One with a failed run is
-    left out; where all have one, the best is among those with the fewest. `REFERENCES`, which know the plant, are left
-    out too. Where all are level, it is a tie.
+    The best is the one with the least mean of those that no other beats with 95 % confidence in the same runs; one that
+    it does not beat so is level. One with a failed run is left out; where all have one, the best is among those with
+    the fewest. `REFERENCES`, which know the plant, are left out too. Where all are level, it is a tie.
     """
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
@@ -231,9 +234,12 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
         fine = [name for name, row in own.items() if not row["failed"]] or list(own)
         cells = []
         for metric, window in LEADING.values():
-            best, *others = sorted(
-                fine, key=lambda name: (own[name]["failed"], _window(own[name][metric], window)["value"])
-            )
+            beaten = {
+                one for other in fine for one in fine if other != one and verdict(own[other], one, metric, window) < 0
+            }
+            order = sorted(fine, key=lambda name: (own[name]["failed"], _window(own[name][metric], window)["value"]))
+            best = next((one for one in order if one not in beaten), order[0])
+            others = [one for one in order if one != best]
             level = [one for one in others if verdict(own[best], one, metric, window) >= 0]
             names = (titled(name) for name in (best, *level))
             cells.append("tie" if others and len(level) == len(others) else ", ".join(names))
@@ -345,8 +351,9 @@ def _less(row: Row, window: str) -> str:
     """Returns the difference from `model` in mm, or `tie`, or – where no run finished with both."""
     if verdict(row, "model", window=window) == 0:
         return "tie"
-    less = 1e3 * _window(row["position_rmse"], window)["less_model"]
-    return _signed(less) if np.isfinite(less) else "–"
+    less, sign = 1e3 * _window(row["position_rmse"], window)["less_model"], verdict(row, "model", window=window)
+    other = f" ({'more' if sign > 0 else 'less'} in most runs)" if sign * less < 0 else ""
+    return _signed(less) + other if np.isfinite(less) else "–"
 
 
 def _signed(value: float) -> str:
@@ -355,6 +362,10 @@ def _signed(value: float) -> str:
 
 def _mean(error: Row) -> str:
     return f"{interval(error)}; {_resolved(1e3 * error['worst'], _step(error))}" if error["samples"] else "–"
+
+
+def _acted(row: Row) -> str:
+    return number(row["guard_events"]) if np.isfinite(row["guard_events"]) else "–"
 
 
 def _converged(row: Row) -> str:

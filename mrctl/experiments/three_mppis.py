@@ -21,6 +21,7 @@ from scipy.optimize import fminbound
 from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import PLANTS, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
+from mrctl.kernel import Array
 from mrctl.loop.runs import simulate
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task, slalom
@@ -29,7 +30,7 @@ from mrctl.navigation.plan import Plan
 from mrctl.navigation.planning import PATIENCE, REACTIVE_PERIOD, prepared
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
-from mrctl.results.comparison import superiority
+from mrctl.results.comparison import quantile_interval, superiority
 from mrctl.results.metrics import control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Disc, Obstacles
@@ -207,7 +208,7 @@ def tables(found: Found, shown: str) -> list[Table]:
             counts = [sum(run.outcome == outcome for run in own) for outcome in ("arrived", "collided")]
             cells = [share_cell(count, len(own)) for count in counts]
             near = np.array([run.clearance for run in own])
-            rows.append([plant, name, *cells, centre_cell(late[name], 2), centre_cell(1e3 * near, 0)])
+            rows.append([plant, name, *cells, median_cell(late[name]), centre_cell(1e3 * near, 0)])
             for rival in (FIRST, SECOND):
                 wins = superiority(late[name], late[rival], floor=TIE)
                 rows[-1].append("" if rival == name else wins_cell(wins))
@@ -226,6 +227,14 @@ def tables(found: Found, shown: str) -> list[Table]:
         f"differences up to {1e3 * TIE:.0f} ms as ties and who does not arrive as last, the third is, against the "
         f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The words follow "
         "from the share of the pairs, whose interval is given the ties. The differences, negative where the third is "
-        "earlier, are over the pairs in which both arrive."
+        "earlier, are over the pairs in which both arrive. Times in the table are medians, with who does not arrive as "
+        "last, and clearances means."
     )
     return [Table(f"Three MPPIs ({shown})", says, frame(rows, header))]
+
+
+def median_cell(times: Array) -> str:
+    """Returns the median of times in s with its 95 % interval; ∞ where it is of robots that do not arrive."""
+    value, low, high = quantile_interval(times, 0.5)[:3]
+    text, *ends = (f"{one:.2f}" if np.isfinite(one) else "∞" if one > 0 else "–" for one in (value, low, high))
+    return f"{text} [{', '.join(ends)}]"

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from mrctl.kernel import Array
 from mrctl.record import InputError
 
-# samples; with fewer the bootstrap of a mean is too narrow: its 95 % interval of four holds it in 80 %
-MIN_BOOTSTRAP = 10
+# samples; with fewer the bootstrap of a mean is too narrow: its 95 % interval holds that of 20 normal samples in 92 %
+MIN_BOOTSTRAP = 40
 TIE = {"v_rmse": 1.64e-4, "omega_rmse": 1.01e-3, "position_rmse": 8.14e-5}
 """Largest differences of two errors of a run in m/s, rad/s and m that the integrator does not resolve, by metric.
 
@@ -66,9 +66,10 @@ def bootstrap_interval(
 ) -> Interval:
     """Returns the mean of the finite samples with its confidence interval.
 
-    It is the bias-corrected, accelerated bootstrap interval (Efron, 1987), or for the mean of fewer than ten samples
-    Student's, because the bootstrap would be too narrow. That of the median is between two order statistics, as in
-    `quantile_interval`, because the bootstrap would be too narrow for any number of samples.
+    It is the bias-corrected, accelerated bootstrap interval (Efron, 1987), or for the mean of fewer than 40 samples
+    Student's, because the bootstrap would be too narrow. Both hold the mean of skew samples less often than they say:
+    Student's in 93 % for 20 lognormal samples with σ = 0.5, and the bootstrap in 91 %. That of the median is between
+    two order statistics, as in `quantile_interval`, because the bootstrap would be too narrow for any number.
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.

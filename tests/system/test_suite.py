@@ -26,6 +26,7 @@ from mrctl.experiments import held_out, report, suite, suite_tables, tuning
 from mrctl.experiments.cases import Case, Choice
 from mrctl.loop.hindsight import best_fixed
 from mrctl.results import metrics, plots
+from mrctl.results.comparison import TIE
 from mrctl.sweep import jobs
 from mrctl.sweep.pool import JobOutcome, Processes
 from mrctl.sweep.store import Store
@@ -228,6 +229,26 @@ def test_leaders() -> None:
     assert suite_tables.leaders(rows) == [["a", *["model, rls"] * 5]]
 
 
+def test_mean_against_pairs() -> None:
+    """Who is worse in 17 of 20 pairs is not the best, although its mean is less, and the table says both."""
+    random = np.random.default_rng(1)
+    model = 1 + 0.01 * random.random(20)
+    fel = np.where(np.arange(20) < 17, 1.1, 0.1) * model
+    lost = np.where(np.arange(20) < 10, 0.5, np.nan)
+    case = Case("a", "steady", (mrctl.Scenario(laps=2),) * 20)
+    runs = {"model": laps_of(model, model), "fel": laps_of(fel, fel), "rls": laps_of(model, lost)}
+    rows = suite.compare([case], {"a": runs})
+    assert fel.mean() < model.mean() and suite_tables.verdict(rows[1], "model") == 1
+    assert suite_tables.leaders(rows) == [["a", *["model"] * 5]]
+    cells = suite_tables.positions(rows)
+    less = f"{1e3 * (fel - model).mean():.1f} (more in most runs)"
+    assert cells.iloc[1, 5] == " / ".join([less] * 3)
+    assert cells["feedforward"].tolist() == ["model", "fel", "rls (10/20 lost)"]
+    # The guard acts twice a lap in each run; those that are lost in the second lap say nothing.
+    runs["rls"]["guard_actions"] = ("run", "lap"), np.where(np.isnan(np.array([model, lost]).T), np.nan, 2.0)
+    assert suite.compare([case], {"a": runs})[2]["guard_events"] == 4
+
+
 def test_all_runs_failed() -> None:
     """Who lost all runs is not the best where each lost one: 19 of 20 pairs are no tie; no cell says nan."""
     random = np.random.default_rng(0)
@@ -290,6 +311,9 @@ def test_floors() -> None:
         found = suite.floors([(whole | more, half | more)], "v_rmse")
         assert found["last"] == pytest.approx((0.3, 0.1, 0.1)) and found["first"] == pytest.approx((0.5, 0.1, 0.1))
     assert set(suite.floors([], "v_rmse").values()) == {(0.0, 0.0, 0.0)}
+    few, many = ((laps_of(*[np.ones(n)] * 2), laps_of(*[1 + 1e-5 * np.arange(n)] * 2)) for n in (5, 6))
+    ties = [suite.floors([({"a": x, "b": x}, {"a": x, "b": y})], "v_rmse")["last"].tie for x, y in (few, many)]
+    assert ties == [TIE["v_rmse"], pytest.approx(2.5e-5)]  # five pairs never tell two apart
 
 
 def test_tie() -> None:
