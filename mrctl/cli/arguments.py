@@ -132,12 +132,15 @@ def refuse_known(arguments: Sequence[str]) -> None:
 
 
 def refuse_twice(arguments: Sequence[str]) -> None:
-    """Refuses a second one of the flags that take several values, because it would replace those of the first.
+    """Refuses --controller without a value, and a second one of the flags that take several, which would replace them.
 
     Raises:
-        InputError: There is one; the message says how to give several values.
+        InputError: There is one; the message says how to give values.
     """
     given = [argument.partition("=")[0] for argument in arguments]
+    for flag, word in zip(arguments, [*arguments[1:], "--"], strict=True):
+        if flag == "--controller" and word.startswith("--"):
+            raise InputError(f"controller: needs a value; see mrctl {arguments[0]} --help")
     for flag in LIST_FLAGS:
         if given.count(flag) > 1:
             how = "joined by commas" if (arguments[0], flag) == ("run", "--controller") else "one after another"

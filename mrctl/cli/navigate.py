@@ -12,7 +12,7 @@ from mrctl.cli.arguments import CONTROLLER_OF_VIEW, NOT_OF_MISSIONS, fields_set
 from mrctl.cli.flags import EXPLAINED_FIELDS, is_short_help, partial_record
 from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, show, warn_if_impossible
 from mrctl.record import InputError, Record
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, feedforward_name
 
 DEFAULTS = {
     "prior": "model, or none where --learner is given",
@@ -97,7 +97,8 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
         if quick or scheduler is not None:
             raise InputError(f"{'quick' if quick else 'scheduler'}: belongs to --suite")
         if not world:
-            raise InputError("world: none given; see mrctl navigate --help")
+            taken = "; it stands before --controller, which takes every name after it" if controller else ""
+            raise InputError(f"world: none given{taken}; see mrctl navigate --help")
         if Path(world).is_dir():
             return _repeat_mission(Path(world), arguments, out, json, controller)
         if view and (out is not None or json):
@@ -107,12 +108,9 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
         if ":" not in world and not Path(world).is_file():
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
         check_world(chosen.world, chosen.robot)
-        front, own = _own(controller)
-        if front is not None:
-            if {"prior", "learner"} & fields_set(arguments):
-                form = "a feedforward of mrctl stands in front of it, as in model+my_file.py:MyFeedforward"
-                raise InputError(f"controller: {form}; leave --prior and --learner out")
-            chosen = chosen.replace(**FEEDFORWARDS[front])
+        own = _own(controller)
+        if own is not None:
+            chosen = _fronted(own, chosen, bool({"prior", "learner"} & fields_set(arguments)))
         warn_if_impossible(chosen)
         from mrctl.navigation.mission import Order
         from mrctl.navigation.tasks import task_of
@@ -133,16 +131,30 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
     return navigate
 
 
-def _own(controller: Sequence[str]) -> tuple[FeedforwardName | None, str | None]:
-    """Returns the feedforward of mrctl in front of a mission's controller of the user, and that without it, or None."""
-    if not controller:
-        return None, None
+def _own(controller: Sequence[str]) -> str | None:
+    """Returns a mission's controller of the user, or None."""
     if len(controller) > 1:
         raise InputError("controller: a mission has one of yours; --suite compares several")
+    return controller[0] if controller else None
+
+
+def _fronted(controller: str, scenario: Scenario, chosen: bool) -> Scenario:
+    """Returns the scenario with the feedforward of mrctl in front of the user's controller.
+
+    Args:
+        controller: The user's controller.
+        scenario: The scenario.
+        chosen: Whether flags have chosen its prior or its learner.
+    """
     from mrctl.loop import user_files
 
-    front, own, _ = user_files.behind(controller[0])
-    return front, own
+    front, own, parts = user_files.behind(controller)
+    if chosen:
+        has_own = any(part.stage == "feedforward" for part in parts)
+        wanted = feedforward_name(scenario.prior, "none" if has_own else scenario.learner)
+        form = own if wanted == "none" else f"{wanted}+{own}"
+        raise InputError(f"controller: leave --prior and --learner out, and write {form}")
+    return scenario.replace(**FEEDFORWARDS[front])
 
 
 def _navigate_suite(
@@ -164,7 +176,7 @@ def _repeat_mission(
         raise InputError(f"{new[0].removeprefix('--')}: {folder} holds a mission, which is driven as it was")
     from mrctl.experiments import mission
 
-    found, departs = mission.repeat(folder, out, json, _own(controller)[1])
+    found, departs = mission.repeat(folder, out, json, _own(controller))
     show(found, out, json)
     expect_same(folder, departs, json)
     _expect_arrival(found.ended)

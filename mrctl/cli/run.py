@@ -62,12 +62,24 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
         from mrctl.experiments import single
 
         scenario = suited(scenario, arguments, scenario_file)
+        _check_learner(scenario, controller, "learner" in fields_set(arguments))
         warn_if_impossible(scenario)
         found = single.run(scenario, out, json, controller)
         show(found, out, json)
         _expect_end(found.ended)
 
     return with_fields(run, default, explained(arguments))
+
+
+def _check_learner(scenario: Scenario, controller: str | None, chosen: bool) -> None:
+    """Refuses a learner that a flag has chosen beside a feedforward of the user, which is in its place."""
+    if controller is None or not chosen or scenario.learner == "none":
+        return
+    from mrctl.loop import user_files
+
+    for part in user_files.split(controller):
+        if part.stage == "feedforward":
+            raise InputError(f"learner: {part.title} is in the place of {scenario.learner}; leave --learner out")
 
 
 def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json: bool, controller: str | None) -> None:

@@ -12,6 +12,9 @@ deviations that cannot take e or ρ out of it are
 ‖G‖₁ are the peak-to-peak gains of the designed loops from a voltage (`rejection`); √2, as ρ² is the sum of the squares
 of what the two channels contribute. With the PIDs of the tiers D_ρ = D.
 
+A learner without a prior begins as PID alone, which lacks the whole voltage U of the model. Its error is no fault of
+the learner, so that ρ̄ is then |(‖G_ρ,1‖₁ max |U_1|, ‖G_ρ,2‖₁ max |U_2|)| where that is larger, up to 0.45 m.
+
 **Blame.** The guard keeps the peak of |d|, which decays with a time constant of 1 s. The learner is to blame for an
 error e if this peak exceeds D, for an error ρ if it exceeds D_ρ, and for an oscillation if it exceeds D/4. The voltage
 that learning has taken from the PID's integral counts like a d; the sum of it decays with the same time constant.
@@ -74,6 +77,7 @@ PEAK_DECAY = 1.0  # s, time constant with which the peak of a deviation decays
 AVERAGING_TIME = 0.5
 RESUME_TIME = 5.0  # s in which a learner that resumes at full gain gets its authority back
 TOLERATED_POSTURE = 0.15  # ρ̄: posture error in m that is always tolerated; a run fails at a lateral one of 1 m
+MAX_TOLERATED_POSTURE = 0.45  # m, ρ̄ at most of a learner without a prior; chosen
 # m/s and rad/s, errors of V and θ̇ that are always tolerated; slow robots start with them
 TOLERATED_VELOCITIES = (0.27, 0.75)
 HEADING_ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
@@ -164,6 +168,7 @@ def mix(g: Row, nominal: Array, voltage: Array, feedback: Array, period: float) 
             g.output[k] = fallback + deviation + g.bump[k]
         wave = swing(feedback[k], k, period, g.feedback)
         count_half_waves(wave, k, g.oscillation * g.harmless[k], MAX_HALF_WAVE, period, g.half_waves)
+        g.needed[k] = max(g.needed[k], abs(nominal[k]))
         g.handed[k] *= decay
         g.deviation[k] = max(abs(deviation), abs(g.handed[k]), decay * g.deviation[k])
         g.model_error[k] += period / (AVERAGING_TIME + period) * (voltage[k] - nominal[k] - g.model_error[k])
@@ -181,13 +186,25 @@ def worst_trouble(g: Row, posture_error: Array, velocity_error: Array) -> int:
         return BROKEN
     for k in range(2):
         deviation = np.inf if g.action == FALLBACK else g.deviation[k]
-        if deviation > g.harmless_to_posture[k] and posture > max(TOLERATED_POSTURE, g.growth * g.nearest):
+        if deviation > g.harmless_to_posture[k] and posture > max(tolerated_posture(g), g.growth * g.nearest):
             return FAR
         if deviation > g.harmless[k] and abs(velocity_error[k]) > g.region[k]:
             return FAST
         if deviation > g.oscillation * g.harmless[k] and g.half_waves.count[k] >= SUSTAINED_HALF_WAVES:
             return OSCILLATION
     return 0
+
+
+@kernel
+def tolerated_posture(g: Row) -> float:
+    """Returns ρ̄ in m, of a learner without a prior at least the error that the lack of the model can cause."""
+    if not g.unaided:
+        return TOLERATED_POSTURE
+    alone = 0.0
+    for k in range(2):
+        if g.needed[k] > 0:
+            alone = np.hypot(alone, g.to_posture[k] * g.needed[k])
+    return min(max(TOLERATED_POSTURE, alone), MAX_TOLERATED_POSTURE)
 
 
 @kernel
@@ -259,6 +276,8 @@ GUARD = np.dtype(
         ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
         ("harmless", "f8", 2),  # D: deviation of a channel that cannot take its velocity out of that region, V (rad/s)
         ("harmless_to_posture", "f8", 2),  # D_ρ: deviation that cannot take the posture out of it either, V (rad/s)
+        ("to_posture", "f8", 2),  # ‖G_ρ‖₁ of each channel, m/V (m s/rad)
+        ("unaided", "?"),  # whether the learner has no prior
         # Oscillation of the PID's output in the two channels
         ("feedback", SWING),
         ("half_waves", HALF_WAVES),
@@ -266,6 +285,7 @@ GUARD = np.dtype(
         ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
         ("handed", "f8", 2),  # sum of what learning took from the PID's integral, which decays, V (rad/s)
         ("nearest", "f8"),  # smallest posture error so far, m
+        ("needed", "f8", 2),  # largest output of the nominal model so far, V (rad/s)
         ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V (rad/s)
         # Decisions
         ("action", "f8"),  # index into `GUARD_ACTIONS`
@@ -287,7 +307,7 @@ GUARD = np.dtype(
 )
 
 
-def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
+def fresh(settings: list[Guard], robot: Rows, gains: Array, unaided: bool) -> Rows:
     """Returns records of `GUARD` at the start of a run, `(B,)`.
 
     Args:
@@ -295,6 +315,7 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
         robot: The nominal robot, as from `nominal`.
         gains: Peak-to-peak gains from a voltage of each channel to its velocity error and to the posture error,
             `(B, 2, 2)`.
+        unaided: Whether the learners have no prior.
     """
     rows = np.zeros(len(settings), GUARD)
     for name in ("on", "oscillation", "growth", "hold", "retries", "fade"):
@@ -304,6 +325,7 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     rows["range"] = ranges(robot)
     rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], TOLERATED_VELOCITIES)
     rows["harmless"], rows["harmless_to_posture"] = harmless(rows["region"], gains)
+    rows["to_posture"], rows["unaided"] = gains[..., 1], unaided
     rows["nearest"] = np.inf
     rows["gain"] = rows["authority"] = 1.0
     return rows

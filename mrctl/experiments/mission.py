@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mrctl.control.stages import Stages
 from mrctl.experiments.tables import Report, json_text, markdown, number, output_folder, write_json
 from mrctl.loop import user_files
-from mrctl.navigation.mission import Mission, Order, order_of
+from mrctl.loop.learned import LEARNED, save_if_learned
+from mrctl.loop.user_stages import named_stages
+from mrctl.navigation.mission import Mission, Order, drove, order_of
+from mrctl.record import InputError
 from mrctl.results import plots
 from mrctl.results.dataset import departure, faults_of, open_result, save, versions
 
@@ -26,12 +32,13 @@ COLUMNS = {
 }
 
 
+MAX_OUTCOME = 40  # characters of an outcome in the table; a longer one, of a stage that raised, stands above it
 FIGURES = plots.path, plots.velocities, plots.errors
-FILES = ["result.zarr", "mission.json", *(file for draw in FIGURES for file in plots.files(draw.__name__))]
+FILES = ["result.zarr", "mission.json", LEARNED, *(file for draw in FIGURES for file in plots.files(draw.__name__))]
 """Names of the files that a mission is saved in."""
 
 
-def run(world: str, order: Order, out: Path | None, as_json: bool, own: str | None = None) -> Report:
+def run(world: str, order: Order, out: Path | None, as_json: bool, controller: str | None = None) -> Report:
     """Drives a mission.
 
     Args:
@@ -39,7 +46,8 @@ def run(world: str, order: Order, out: Path | None, as_json: bool, own: str | No
         order: The mission.
         out: Folder for `result.zarr`, `mission.json` and figures; None saves nothing.
         as_json: Whether to return JSON instead of a table.
-        own: Stages of the user that drive the first robot; see `mrctl.loop.user_files`.
+        controller: Controller of the user that drives the first robot, as for `user_files.behind`, whose feedforward in
+            front is that of the scenario.
 
     Returns:
         The report, with a row for each robot; it `ended` with the outcome of the first robot.
@@ -48,37 +56,64 @@ def run(world: str, order: Order, out: Path | None, as_json: bool, own: str | No
         InputError: As `navigate`, or the folder cannot be written or holds a result already.
     """
     with output_folder(out, FILES):
-        stages: Stages = user_files.load(own) if own else {}
+        stages: Stages = user_files.load(user_files.behind(controller)[1]) if controller else {}
         driven = order.drive(progress=True, **stages)
-    return _report(world, order, driven, out, as_json, own)
+    return _report(world, order, driven, out, as_json, controller)
 
 
-def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None) -> tuple[Report, str]:
+def repeat(folder: Path, out: Path | None, as_json: bool, controller: str | None = None) -> tuple[Report, str]:
     """Drives a saved mission again, and compares it with what was saved.
 
     Args:
         folder: What `run` wrote as `out`.
         out: As for `run`.
         as_json: As for `run`.
-        own: The stages of the user that drove it; what is saved holds only their names.
+        controller: The controller of the user that drove it; what is saved holds only its name.
 
     Returns:
         What `run` returns; and in which signal the mission departs from the saved one, or "".
 
     Raises:
-        InputError: As `mrctl.navigation.mission.again`; or the folder has no result, or other stages drove it; or `out`
-            cannot be written or holds one already.
+        InputError: As `mrctl.navigation.mission.again`, or `out` cannot be written or holds a result already.
     """
     with output_folder(out, FILES):
         order, saved = order_of(folder), open_result(folder / "result.zarr")
-        drove = json.loads(saved.attrs.get("stages", "{}"))
-        if order.avoid != "none":
-            drove.pop("motion", None)  # the avoider, which the order names
-        driven = order.drive(progress=True, **user_files.load_same(own, drove, folder))
-    return _report(str(folder), order, driven, out, as_json, own), departure(driven.result, saved)
+        stages = _expected(folder, order, controller)
+        driven = order.drive(progress=True, **stages)
+    departs = departure(driven.result, saved)
+    if departs and controller and _read(folder).get("controller_digest", "") != _digest(controller):
+        departs += f"; the code of {controller} has changed since"
+    return _report(str(folder), order, driven, out, as_json, controller), departs
 
 
-def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json: bool, own: str | None) -> Report:
+def _read(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "mission.json").read_text("utf-8"))
+
+
+def _digest(controller: str) -> str:
+    return user_files.digest(user_files.behind(controller)[1])
+
+
+def _expected(folder: Path, order: Order, controller: str | None) -> Stages:
+    """Returns the stages of the user that drive a saved mission again.
+
+    Raises:
+        InputError: The controller is not the one that drove it, or is refused, as by `user_files.load`.
+    """
+    saved = _read(folder).get("controller")
+    needed = f"--controller {shlex.quote(saved)}" if saved else "no --controller"
+    if controller is None and saved is None:
+        return {}
+    stages: Stages = user_files.load(user_files.behind(controller)[1]) if controller else {}
+    fronts = [controller and user_files.behind(controller)[0], saved and user_files.behind(saved)[0]]
+    if fronts[0] != fronts[1] or named_stages(stages) != drove(folder, order):
+        raise InputError(f"controller: {folder} needs {needed}, as when it was saved")
+    return stages
+
+
+def _report(
+    world: str, order: Order, driven: Mission, out: Path | None, as_json: bool, controller: str | None
+) -> Report:
     """Returns what `run` returns; what is saved holds all that the mission is a function of."""
     table, faults = driven.table, faults_of(driven.result.isel(run=0))
     values = {
@@ -86,7 +121,8 @@ def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json
         "start": order.task.start,
         "goal": order.task.goal,
         **order.model_dump(mode="json"),
-        "controller": own,
+        "controller": controller,
+        "controller_digest": controller and _digest(controller),
         "plan": {"length": driven.plan.length, "expanded": driven.plan.expanded, "poses": driven.plan.poses.tolist()},
         "versions": versions(),
         "faults": faults,
@@ -100,11 +136,15 @@ def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json
     rows = [
         [
             robot["label"],
-            robot["outcome"],
-            *("–" if name in unsaid else number(scale * robot[name]) for name, (_, scale) in COLUMNS.items()),
+            robot["outcome"] if len(robot["outcome"]) <= MAX_OUTCOME else "failed",
+            *(
+                "–" if name in unsaid or not np.isfinite(robot[name]) else number(scale * robot[name])
+                for name, (_, scale) in COLUMNS.items()
+            ),
         ]
         for robot in values["robots"]
     ]
+    faults += [f"{one['label']}: {one['outcome']}" for one in values["robots"] if len(one["outcome"]) > MAX_OUTCOME]
     title = f"plan of {driven.plan.length:.2f} m; number of poses that the search expanded: {driven.plan.expanded:,}"
     text = "\n".join([title, *faults, markdown(["robot", "outcome", *(title for title, _ in COLUMNS.values())], rows)])
     return Report(text, outcome, write)
@@ -116,5 +156,6 @@ def _save(driven: Mission, values: dict[str, Any], out: Path | None) -> None:
         return
     save(driven.result, out / "result.zarr")
     write_json(out / "mission.json", values)
+    save_if_learned(out / LEARNED, driven.result.isel(run=0))
     for draw in FIGURES:
         plots.save(draw(driven.result), out, draw.__name__)

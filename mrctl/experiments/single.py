@@ -15,8 +15,9 @@ from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.hierarchy import MAX_LEARNING_SLIP
 from mrctl.loop.hindsight import best_fixed
-from mrctl.loop.learned import save_learned
+from mrctl.loop.learned import LEARNED, save_if_learned
 from mrctl.loop.runs import simulate
+from mrctl.loop.user_stages import expect_stages
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.dataset import departure, faults_of, save, scenarios_of, versions
@@ -89,7 +90,8 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
         scenarios = scenarios_of(saved)
         if len(scenarios) != 1:
             raise InputError(f"{folder}: holds {len(scenarios)} runs; mrctl run repeats a single one")
-        stages = user_files.load_same(own, json.loads(saved.attrs.get("stages", "{}")), folder)
+        stages: Stages = user_files.load(own) if own else {}
+        expect_stages(stages, json.loads(saved.attrs.get("stages", "{}")), folder)
         result = simulate(scenarios, progress=True, **stages)
     return _report(scenarios[0], result, out, as_json, own), departure(result, saved)
 
@@ -230,7 +232,7 @@ def _unreached(scenario: Scenario, run: xr.Dataset) -> list[str]:
 def _written() -> list[str]:
     from mrctl.results import plots  # imported here because a run that draws nothing needs no matplotlib
 
-    return ["result.zarr", "learned.safetensors", *(file for name in FIGURES for file in plots.files(name))]
+    return ["result.zarr", LEARNED, *(file for name in FIGURES for file in plots.files(name))]
 
 
 def _save(result: xr.Dataset, laps: xr.Dataset, out: Path | None) -> None:
@@ -238,8 +240,7 @@ def _save(result: xr.Dataset, laps: xr.Dataset, out: Path | None) -> None:
     if out is None:
         return
     save(result, out / "result.zarr")
-    if "weights" in result and not result["failed"].any() and np.isfinite(result["weights"]).all():
-        save_learned(out / "learned.safetensors", result)
+    save_if_learned(out / LEARNED, result)
     from mrctl.results import plots
 
     for name, function in FIGURES.items():

@@ -275,7 +275,8 @@ class Hierarchy:
             self._design_pid(row)
             self._design_motion(row)
         rejected = np.array([self._rejection(row) for row in range(size)])
-        state["guard"] = guarding.fresh([s.guard for s in scenarios], self.nominal, rejected)
+        unaided = first.prior == "none"
+        state["guard"] = guarding.fresh([s.guard for s in scenarios], self.nominal, rejected, unaided)
         state["guard"]["on"] &= self.learner.guarded
         self.gains: dict[str, Array] = {name: state["pid"][name].copy() for name in ("k_p", "k_i")}
         self.gains |= {name: state["kanayama"][name].copy() for name in ("k_x", "k_y", "k_theta")}
@@ -365,8 +366,9 @@ class Hierarchy:
     def _tolerate(self, row: int) -> None:
         """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
         guard = self.state["guard"]
-        found = guarding.harmless(guard["region"][row], np.array(self._rejection(row)))
-        guard["harmless"][row], guard["harmless_to_posture"][row] = found
+        gains = np.array(self._rejection(row))
+        guard["harmless"][row], guard["harmless_to_posture"][row] = guarding.harmless(guard["region"][row], gains)
+        guard["to_posture"][row] = gains[:, 1]
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
         """Returns the peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
@@ -421,6 +423,8 @@ class Hierarchy:
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Bumpless start: the integral holds the voltage that the nominal robot needs for its initial motion.
 
+        Where the learner starts from a file, it holds nothing: it would cancel what was learned of the robot.
+
         Args:
             twist: Initial twist of the robots in m/s and rad/s, `(B, 2)`.
             acceleration: Its derivative along the reference in m/s² and rad/s², `(B, 2)`.
@@ -429,7 +433,8 @@ class Hierarchy:
         """
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        self.state["pid"]["integral"][rows] = self.steady(twist, acceleration)[rows]
+        learned = np.array([own.learned is not None for own in self.settings])
+        self.state["pid"]["integral"][rows] = np.where(learned[:, None], 0.0, self.steady(twist, acceleration))[rows]
 
     def steady(self, twist: Array, acceleration: Array) -> Array:
         """Returns the voltage that the nominal robot needs for a motion, less that of the feedforward, `(B, 2)`."""

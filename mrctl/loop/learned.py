@@ -17,6 +17,8 @@ from mrctl.record import InputError
 from mrctl.results.dataset import check_kind, scenarios_of, written_by
 from mrctl.scenario import Scenario
 
+LEARNED = "learned.safetensors"
+"""Name of the file that a command writes."""
 LAYOUT = "weights_layout"
 """Variable of a result with a feedforward of the user: its name, and names and shapes of its `weights`, as JSON."""
 
@@ -54,7 +56,7 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
     if "weights" not in one:
         raise InputError("learned: no learner of the run keeps anything; one of your own needs the method adapted")
     (scenario,) = scenarios_of(one)
-    if LAYOUT in one:
+    if LAYOUT in one and one[LAYOUT].item():
         own = json.loads(one[LAYOUT].item())
         learner, layout = own["learner"], own["shapes"]
     else:
@@ -67,7 +69,19 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         if not np.isfinite(array).all():
             raise InputError(f"learned: {name} of {learner} is not finite, and no run could start from it")
     notes = {"learner": learner, "robot": scenario.robot.path, "prior": scenario.prior}
+    notes |= {"output_scale": repr(scenario.fel.output_scale)} if learner == "fel" else {}
     write_arrays(path, arrays, notes | {"steering": str(one["steering"].values)})
+
+
+def save_if_learned(path: Path, run: xr.Dataset) -> None:
+    """Writes a file as `save_learned` where a run ended well and its learner keeps something finite; else nothing."""
+    one = run.squeeze("run") if "run" in run.dims else run
+    if "weights" not in one or one["failed"]:
+        return
+    weights = one["weights"].values
+    held = weights[: np.flatnonzero(~np.isnan(weights)).max(initial=-1) + 1]  # as for others, NaN may follow
+    if len(held) and np.isfinite(held).all():
+        save_learned(path, one)
 
 
 def load_learned(scenario: Scenario) -> Array:
@@ -82,7 +96,7 @@ def load_learned(scenario: Scenario) -> Array:
 
 
 def load_arrays(scenario: Scenario, learner: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Reads what a learner of this name starts from, by name; warns if another robot or kind of steering learned it.
+    """Reads what a learner of this name starts from, by name; warns if another robot learned it.
 
     Args:
         scenario: The scenario, whose `learned` names the file.
@@ -91,7 +105,8 @@ def load_arrays(scenario: Scenario, learner: str, expected: Mapping[str, tuple[i
 
     Raises:
         InputError: The file is missing, broken, or of another learner; or what it holds was learned with a prior and
-            the scenario has none, or the other way round.
+            the scenario has none, or the other way round; or with rigid steering, whose second channel is no voltage,
+            and the scenario has another, or the other way round; or with another scale of the output of `fel`.
     """
     notes = notes_on(str(scenario.learned))
     if (other := notes.get("learner", learner)) != learner:
@@ -100,7 +115,11 @@ def load_arrays(scenario: Scenario, learner: str, expected: Mapping[str, tuple[i
         raise InputError(f"learned: {scenario.learned} was learned with the prior {prior}, not with {scenario.prior}")
     steering = scenario.steering or notes.get("steering")  # a scenario may leave it to the robot
     if ((other := notes.get("steering", steering)) == "rigid") != (steering == "rigid"):
-        warnings.warn(f"learned: {scenario.learned} was learned with {other} steering, not {steering}", stacklevel=2)
+        raise InputError(f"learned: {scenario.learned} was learned with {other} steering, not with {steering}")
+    if learner == "fel" and float(scale := notes.get("output_scale", scenario.fel.output_scale)) != (
+        own_scale := scenario.fel.output_scale
+    ):
+        raise InputError(f"learned: {scenario.learned} was learned with fel.output_scale {scale}, not {own_scale:g}")
     own = scenario.robot.path
     if Path(robot := notes.get("robot", own)).name != Path(own).name:
         warnings.warn(f"learned: {scenario.learned} was learned on the robot {robot}, not on {own}", stacklevel=2)

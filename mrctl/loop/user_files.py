@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop.simulation import Simulation
-from mrctl.loop.user_stages import StageError, named_stages
-from mrctl.record import InputError
+from mrctl.loop.user_stages import StageError
+from mrctl.record import InputError, nearest
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
 NOT_BESIDE = {*sys.stdlib_module_names, "mrctl"}
@@ -79,6 +79,10 @@ def split(name: str) -> list[Part]:
         if not attribute:
             form = "my_file.py:MyController or my_file.py:MyController(gain=0.3)"
             raise InputError(f"controller: {part!r} is not of the form {form}")
+        if "+" in stage and _front(stage) == "none":
+            front = stage.rpartition("+")[0]
+            meant = f"; did you mean {close}?" if (close := nearest(front, [*FEEDFORWARDS])) else ""
+            raise InputError(f"controller: {front} is no feedforward of mrctl{meant}")
         if stage not in METHODS:
             raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}{_remedy(stage)}")
         if stage in {known.stage for known in found}:
@@ -109,13 +113,15 @@ def behind(name: str) -> tuple[FeedforwardName, str, list[Part]]:
     Raises:
         InputError: The name is refused, as by `split`, or a learner is in front of a feedforward of the user.
     """
+    if name in FEEDFORWARDS:
+        raise InputError(f"controller: {name} is one of mrctl; give its prior and learner, and no controller")
     front = _front(name)
     own = name.removeprefix(f"{front}+")
     found = split(own)
     if FEEDFORWARDS[front]["learner"] != "none" and any(part.stage == "feedforward" for part in found):
         raise InputError(
             f"controller: {name!r} has two feedforwards; yours is in the place of a learner, and only model+ can be in "
-            "front of it"
+            f"front of it; another stage is named, as in {front}+feedback=my_file.py:MyFeedback"
         )
     return front, own, found
 
@@ -250,25 +256,6 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
         factory = partial(factory, **part.settings)
         factory.__name__ = part.title  # type: ignore[attr-defined] (the name in labels and messages)
     return factory
-
-
-def load_same(name: str | None, drove: Mapping[str, str], source: Path) -> Stages:
-    """Runs the files of the stages that drove a saved run, which holds their names alone; returns them as `load` does.
-
-    Args:
-        name: What the user says has driven it; None for nothing.
-        drove: Names of the factories that drove it, by stage.
-        source: Where the run was saved, for messages.
-
-    Raises:
-        InputError: The name is refused, as by `load`, or other stages drove the run.
-    """
-    stages: Stages = load(name) if name else {}
-    if named_stages(stages) != drove:
-        names = ", ".join(f"{stage}={factory}" for stage, factory in drove.items())
-        needed = f"--controller with {names}" if names else "no --controller"
-        raise InputError(f"controller: the run in {source} needs {needed}, as when it was saved")
-    return stages
 
 
 def without_learned(name: str, scenario: Scenario) -> Scenario:

@@ -144,6 +144,23 @@ def named_stages(stages: Stages) -> dict[str, str]:
     return {stage: name_of(factory) for stage, factory in stages.items() if factory}
 
 
+def expect_stages(stages: Stages, drove: Mapping[str, str], source: Path) -> None:
+    """Refuses other stages than those that drove a saved run, which holds their names alone.
+
+    Args:
+        stages: Those that are to drive it again.
+        drove: Names of the factories that drove it, by stage.
+        source: Where the run was saved, for the message.
+
+    Raises:
+        InputError: They differ.
+    """
+    if named_stages(stages) != drove:
+        names = ", ".join(f"{stage}={factory}" for stage, factory in drove.items())
+        needed = f"--controller with {names}" if names else "no --controller"
+        raise InputError(f"controller: the run in {source} needs {needed}, as when it was saved")
+
+
 def name_of(factory: object) -> str:
     """Returns the name of a factory; for a `partial` that of its function, with the settings as in a call."""
     if isinstance(factory, partial) and not hasattr(factory, "__name__"):

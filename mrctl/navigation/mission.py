@@ -16,12 +16,13 @@ from mrctl.control.stages import Stages
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.runs import simulate
+from mrctl.loop.user_stages import expect_stages
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.plan import Plan
 from mrctl.navigation.planning import PLAN_MARGIN, Avoid, prepared
 from mrctl.record import InputError, Record, read_file
-from mrctl.results.dataset import combine
+from mrctl.results.dataset import combine, open_result
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.obstacles import Pose
@@ -90,11 +91,33 @@ def order_of(folder: str | Path) -> Order:
 
 
 def again(folder: str | Path, progress: bool = False, **stages: Unpack[Stages]) -> Mission:
-    """Drives a saved mission again, with the same bits; arguments and errors are those of `order_of` and `navigate`.
+    """Drives a saved mission again, with the same bits, if the stages of the user that drove it are the same.
 
-    A mission that stages of the user drove needs the same ones.
+    Args:
+        folder: What `mrctl navigate … --out` wrote.
+        progress: Whether to show a progress bar.
+        stages: The stages of the user that drove its first robot.
+
+    Raises:
+        InputError: Other stages drove it, or as `order_of` and `navigate`.
     """
-    return order_of(folder).drive(progress, **stages)
+    order = order_of(folder)
+    expect_stages(stages, drove(folder, order), Path(folder))
+    return order.drive(progress, **stages)
+
+
+def drove(folder: str | Path, order: Order) -> dict[str, str]:
+    """Returns the names of the stages of the user that drove a saved mission, by stage.
+
+    Args:
+        folder: Where it was saved.
+        order: Its order.
+
+    Raises:
+        InputError: Its result is not there.
+    """
+    found = json.loads(open_result(Path(folder) / "result.zarr").attrs.get("stages", "{}"))
+    return {stage: name for stage, name in found.items() if order.avoid == "none" or stage != "motion"}
 
 
 def navigate(

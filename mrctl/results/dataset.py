@@ -250,6 +250,7 @@ def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Seque
     whole = parts[0]  # one is not copied
     if len(parts) > 1:
         whole = xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal").sortby("run")
+        whole = whole.assign({k: v.fillna("") for k, v in whole.data_vars.items() if v.dtype == object})  # some lack it
     whole.attrs = {
         "scenarios": json.dumps([s.model_dump(mode="json") for s in scenarios]),
         "versions": json.dumps(versions()),

@@ -99,8 +99,8 @@ def test_refused(files, tmp_path):
     (tmp_path / "learned.safetensors").touch()
     with pytest.raises(InputError, match=r"^learned: .* is a folder; give .*/learned\.safetensors$"):
         Simulation([BASE.replace(learned=tmp_path)])
-    other = BASE.replace(robot="racecar", reference=Circle(radius=1.5, period=8.0), learned=files["fel"][0])
-    with pytest.warns(UserWarning, match=r"fel\.safetensors was learned on the robot car, not on racecar$"):
+    other = BASE.replace(robot="turtlebot", reference=Circle(radius=0.5, period=12.0), learned=files["fel"][0])
+    with pytest.warns(UserWarning, match=r"fel\.safetensors was learned on the robot car, not on turtlebot$"):
         Simulation([other])
     with pytest.raises(InputError, match="^result: must be an xarray.Dataset, .* not of type PosixPath$"):
         mrctl.save_learned(files["fel"][1], tmp_path / "x.safetensors")  # in the order of `mrctl.save`
@@ -138,8 +138,24 @@ def test_other_voltages(files, tmp_path):
     with pytest.raises(InputError, match=r"learned with the prior model, not with none$"):
         mrctl.simulate(alone)
     rigid = BASE.model_copy(update=FEEDFORWARDS["model+rls"] | {"learned": files["model+rls"][0], "steering": "rigid"})
-    with pytest.warns(UserWarning, match=r"learned with compliant steering, not rigid$"):
+    with pytest.raises(InputError, match=r"learned with compliant steering, not with rigid$"):
         mrctl.simulate(rigid)
+    scaled = BASE.model_copy(update=FEEDFORWARDS["fel"] | {"learned": files["fel"][0], "fel": Fel(output_scale=12.0)})
+    with pytest.raises(InputError, match=r"learned with fel\.output_scale 6\.0, not 12$"):
+        mrctl.simulate(scaled)
+
+
+@pytest.mark.parametrize("name", ["fel", "model+rls", "model+composite"])
+def test_start_with_what_was_learned(name, tmp_path):
+    """A robot that starts with what was learned of it has less error than one that knows nothing, from the start on."""
+    new = mrctl.Scenario(perturbation="all", initial_spread=(0, 0, 0), **FEEDFORWARDS[name])
+    first = mrctl.simulate(new.replace(laps=3))
+    mrctl.save_learned(tmp_path / "all.safetensors", first)
+    again = mrctl.simulate(new.replace(laps=1, learned=str(tmp_path / "all.safetensors")))
+    without, known = (
+        np.sqrt(np.mean(run.longitudinal_error[:50] ** 2 + run.lateral_error[:50] ** 2)) for run in (first, again)
+    )
+    assert known < 0.6 * without
 
 
 def test_norm_of_what_was_learned(files):

@@ -10,6 +10,7 @@ from test_commands import refused
 
 import mrctl
 from mrctl import Box, Disc, Event, InputError, Kanayama, Obstacles, Scenario, cli
+from mrctl.control.weights import read_arrays
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.barrier import Barrier
@@ -20,14 +21,18 @@ from mrctl.navigation.planning import Avoid, prepared
 from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
+from mrctl.results.dataset import departure
 from mrctl.theory.clearance import cover
 
 PID = Scenario(learner="none")
 OWN = """
+import numpy as np
+
 class Half:
-    def __init__(self, robot, size): ...
+    def __init__(self, robot, size): self.kept = np.full((size, 1), 0.5)
     def output(self, command, derivative): return 0.5 * command
     def learn(self, feedback, frozen, twist, voltage): ...
+    def adapted(self): return {"half": self.kept}
 
 class Other(Half): ...
 
@@ -114,14 +119,14 @@ def test_own_controller(avoid: Avoid, tmp_path: Path, capsys: pytest.CaptureFixt
     own, out = tmp_path / "own.py", tmp_path / "out"
     own.write_text(OWN)
     given, name = ["navigate", "doorway:3", "--avoid", avoid], f"model+{own}:Half"
-    assert cli.main([*given, "--controller", name, "--compare", "model", "none", "--out", str(out)]) == 0
+    assert cli.main([*given, "--controller", name, "--compare", "model", "fel", "--out", str(out)]) == 0
     printed, result = capsys.readouterr().out, mrctl.open(out / "result.zarr")
     beside = "" if avoid == "none" else " + window"
-    assert result["label"].values.tolist() == [label + beside for label in ("model+Half", "model", "none")]
+    assert result["label"].values.tolist() == [label + beside for label in ("model+Half", "model", "fel")]
     assert f"| model+Half{beside} " in printed and "| arrived |" in printed
     robot = Scenario(prior="model", learner="none")
     task = task_of("doorway:3", robot)
-    whole, (_, scenario) = navigate(task, robot, ["none"], avoid=avoid), prepared(task, robot, avoid=avoid)
+    whole, (_, scenario) = navigate(task, robot, ["fel"], avoid=avoid), prepared(task, robot, avoid=avoid)
     namespace = {}
     exec(OWN, namespace)  # noqa: S102
     single = mrctl.simulate(scenario, motion=avoiding(avoid), feedforward=namespace["Half"])
@@ -131,11 +136,18 @@ def test_own_controller(avoid: Avoid, tmp_path: Path, capsys: pytest.CaptureFixt
         alone = single[signal].dropna("time").values
         assert np.array_equal(ours[0, : len(alone)], alone) and np.isnan(ours[0, len(alone) :]).all()
         assert not np.array_equal(ours[0, :100], ours[1, :100])
-    assert cli.main(["navigate", str(out), "--controller", f"{own}:Half"]) == 0
+    assert read_arrays(out / "learned.safetensors", "learned", {"half": (1,)})["half"] == 0.5
+    assert cli.main(["navigate", str(out), "--controller", name]) == 0
     assert f"{out}: bit-identical" in capsys.readouterr().out
-    needs = f"controller: the run in {out} needs --controller with feedforward=Half, as when it was saved"
-    assert needs in refused(capsys, "navigate", str(out))
-    assert needs in refused(capsys, "navigate", str(out), "--controller", f"{own}:Other")
+    assert not departure(again(out, feedforward=namespace["Half"]).result, result)
+    for other in ([], ["--controller", f"{own}:Half"], ["--controller", f"model+{own}:Other"]):
+        needs = f"mrctl: controller: {out} needs --controller {name}, as when it was saved"
+        assert refused(capsys, "navigate", str(out), *other) == needs
+    with pytest.raises(InputError, match=r"^controller: the run in .* needs --controller with feedforward=Half, as"):
+        again(out)
+    own.write_text(OWN.replace("0.5 * command", "0.4 * command"))
+    assert cli.main(["navigate", str(out), "--controller", name]) == 1
+    assert f"; the code of {name} has changed since" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -143,9 +155,26 @@ def test_own_controller(avoid: Avoid, tmp_path: Path, capsys: pytest.CaptureFixt
     [
         (["--controller", "a.py:X", "b.py:Y"], "controller: a mission has one of yours; --suite compares several"),
         (
-            ["--controller", "a.py:X", "--learner", "rls"],
-            "controller: a feedforward of mrctl stands in front of it,",
+            ["--controller", "a.py:X", "--prior", "model"],
+            "controller: leave --prior and --learner out, and write",
         ),
+        (
+            ["--learner", "rls", "--controller", "feedback=a.py:X"],
+            "controller: leave --prior and --learner out, and write rls+feedback=a.py:X",
+        ),
+        (
+            ["--controller", "model+composit+feedback=a.py:X"],
+            "controller: composit is no feedforward of mrctl;",
+        ),
+        (
+            ["--controller", "model+composite+a.py:X"],
+            "controller: 'model+composite+a.py:X' has two feedforwards;",
+        ),
+        (
+            ["--controller", "model+composite"],
+            "controller: model+composite is one of mrctl; give its",
+        ),
+        (["--controller"], "controller: needs a value; see mrctl navigate --help"),
         (["--controller", "a.py:X", "--view"], "controller: a live session drives with those of mrctl; with your own,"),
         (["--controller", "a.py:X"], "controller: no file a.py in "),
         (["--controller", "motion=own.py:Half", "--avoid", "mppi"], "motion: your own motion controller cannot drive"),

@@ -32,10 +32,10 @@ GAINS = (0.1, 0.01), (0.5, 0.01)  # from 1 V to the errors of velocity and posit
 class Bench:
     """One robot's guard and what it is connected to, by default in peace."""
 
-    def __init__(self, rigid=False, gains=GAINS, **settings):
+    def __init__(self, rigid=False, gains=GAINS, unaided=False, **settings):
         robot = np.zeros(1, NOMINAL)
         robot["supply"], robot["max_twist"], robot["rigid"] = SUPPLY, (1.5, ROTATION), rigid
-        self.g = fresh([Guard(**settings)], robot, np.array([gains]))[0]
+        self.g = fresh([Guard(**settings)], robot, np.array([gains]), unaided)[0]
         self.rigid, self.pid, self.feedback = rigid, np.zeros(1, PID)[0], np.zeros(2)
         self.integral = self.pid["integral"]
         self.ticks = 0
