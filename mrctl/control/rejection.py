@@ -25,7 +25,10 @@ from mrctl.theory.linear import Linear
 from mrctl.theory.robot import Robot
 
 DIRECTIONS = 32  # combinations of two errors in which the peak of their length is looked for
-RESPONSE_TIME = 10.0  # s over which responses are added up, rounded up to 2ⁿ periods
+RESPONSE_TIME = 10.0  # s over which responses are added up at least, rounded up to 2ⁿ periods
+# Share of a sum that the second half of the response may have, and periods (2ⁿ) after which a sum that has not settled
+# so is infinite.
+SETTLED, MAX_DOUBLINGS = 1e-3, 17
 
 
 class Peaks(NamedTuple):
@@ -131,23 +134,36 @@ class LinearLoop:
         self.errors[0, c], self.errors[0, 0], self.errors[1, p], self.errors[2, h] = 1.0, -1.0, 1.0, HEADING_ARM
         self.state = {"velocity": 0, "integral": i, "correction": c, "position": p, "heading": h}
         self._doublings = int(np.ceil(np.log2(RESPONSE_TIME / period)))
+        self._holds_posture = k_x > 0 if channel == 0 else k_y > 0 and k_theta > 0
 
-    def response(self, state: Array) -> Array:
-        """Velocity error, position error and `HEADING_ARM` times the heading error after a state, `(3, n)`."""
+    def response(self, state: Array, doublings: int = 0) -> Array:
+        """Velocity error, position error and `HEADING_ARM` times the heading error after a state, `(3, n)`.
+
+        Args:
+            state: The state.
+            doublings: n is 2 to this power; 0 for what `RESPONSE_TIME` is.
+        """
         states, power = state[:, None], self.step
-        for _ in range(self._doublings):  # x(n … 2n) = Aⁿ x(0 … n)
+        for _ in range(doublings or self._doublings):  # x(n … 2n) = Aⁿ x(0 … n)
             states, power = np.hstack([states, power @ states]), power @ power
         return self.errors @ states
 
     def sums(self) -> tuple[float, float]:
-        """‖G‖₁ of the velocity error and of the posture error; infinite where the loop is unstable.
+        """‖G‖₁ of the velocity error and of the posture error; infinite where they do not settle.
 
         The length of two errors never exceeds L if no combination cos φ e₁ + sin φ e₂ does.
         """
         if np.abs(np.linalg.eigvals(self.step)).max() > 1 + 1e-9:
             return np.inf, np.inf
-        velocity, *posture = self.response(self.pulse)
         angles = np.pi / DIRECTIONS * np.arange(DIRECTIONS)
-        combined = np.column_stack([np.cos(angles), np.sin(angles)]) @ np.array(posture)
+        directions = np.zeros((1 + DIRECTIONS, 3))
+        directions[0, 0], directions[1:, 1], directions[1:, 2] = 1.0, np.cos(angles), np.sin(angles)
+        for doublings in range(self._doublings, MAX_DOUBLINGS + 1):
+            errors = np.abs(directions @ self.response(self.pulse, doublings))
+            sums, late = errors.sum(axis=1), errors[:, errors.shape[1] // 2 :].sum(axis=1)
+            settled = late <= SETTLED * sums
+            if settled[0] and (settled[1:].all() or not self._holds_posture):
+                break
+        velocity, posture = sums[0] if settled[0] else np.inf, sums[1:].max() if settled[1:].all() else np.inf
         between = np.cos(np.pi / (2 * DIRECTIONS))  # of the worst combination with the next one that is looked at
-        return float(np.abs(velocity).sum()), float(np.abs(combined).sum(axis=1).max() / between)
+        return float(velocity), float(posture / between)

@@ -80,6 +80,17 @@ def test_too_fast(steering, name, delay, times):
     assert (actions[1][~lost] == 0).all() and lost.any() == runs.failed[1]
 
 
+@pytest.mark.parametrize("tier", ["ideal", "lab"])
+def test_slow_pid_without_a_prior(tier):
+    """PID alone is far off with a slow PID; the guard does not take that for a fault of `fel`, which learns it away."""
+    start = {"prior": "none", "learner": "fel", "pid": {"time_constant": 0.15}, "sensing": {"tier": tier}}
+    scenario = Scenario.from_dict(start | {"laps": 4, "seed": 1})
+    runs = simulate([scenario, scenario.replace(guard={"on": False}), scenario.replace(learner="none")])
+    lap = per_lap(runs).position_rmse.values
+    assert guard_events(runs).empty and np.array_equal(lap[0], lap[1])
+    assert lap[2, -1] > 0.1 and lap[0, -1] < 0.1 * lap[2, -1]
+
+
 def test_silent():
     """Learners in order: nothing happens, and every bit is what it is without a guard."""
     push = (Event(time=6.0, push=(0.0, 40.0, 0.0)), Event(time=9.0, perturbation=Perturbation(payload=5.0)))

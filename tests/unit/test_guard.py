@@ -185,6 +185,44 @@ def test_blame_fades():
 
 
 @pytest.mark.parametrize("channel", [0, 1])
+def test_slow_motion_controller(robot, channel):
+    """The response of the posture to a voltage is summed to its end, and without a motion controller it has none."""
+    gains, plant = Pid(time_constant=0.15).channels(robot, False), (common(robot), yaw(robot, 0.75))[channel]
+
+    def loop(*k):
+        over = MotionDesign(Kanayama(k_x=k[0], k_y=k[1], k_theta=k[2]), 0.05, (0.0, 0.0))
+        return LinearLoop(robot, False, channel, plant, gains[channel], over, 0.75, 0.0, PERIOD)
+
+    slow = loop(0.03, 0.02, 0.3)  # in some 30 s
+    state, total = slow.pulse, np.zeros(2)
+    for _ in range(40_000):
+        velocity, position, heading = slow.errors @ state
+        total, state = total + (abs(velocity), abs(position if channel == 0 else heading)), slow.step @ state
+    velocity, posture = slow.sums()
+    assert velocity == pytest.approx(total[0], rel=2e-3)
+    assert posture == pytest.approx(total[1], rel=5e-3) if channel == 0 else posture > total[1]
+    assert slow.sums()[1] > 1.05 * np.abs(slow.response(slow.pulse, 10)[1 + channel]).sum()  # of 10 s
+    # The integral of the PI takes position and heading back, but not the lateral position.
+    assert np.isfinite(loop(0, 0, 0).sums()).tolist() == [True, channel == 0]
+
+
+@pytest.mark.parametrize(("unaided", "acts"), [(False, True), (True, False)])
+def test_posture_without_a_prior(unaided, acts):
+    """A learner without a prior may be where the lack of the model can take the robot, up to 0.45 m, and no farther.
+
+    From 1 V a position error of 0.03 m can follow; the model asks for 8 V, so that 0.24 m may be its lack.
+    """
+    for posture, ends in ((0.2, acts), (0.3, True)):
+        bench = Bench(gains=((0.1, 0.03), (0.5, 0.03)), unaided=unaided)
+        bench.tick()
+        assert (bench.tick(nominal=(8, 0), error=posture) == "fallback") == ends
+    for posture, ends in ((0.44, acts), (0.46, True)):
+        bench = Bench(gains=((0.1, 0.3), (0.5, 0.3)), unaided=unaided)
+        bench.tick()
+        assert (bench.tick(nominal=(8, 0), error=posture) == "fallback") == ends
+
+
+@pytest.mark.parametrize("channel", [0, 1])
 def test_forgotten(robot, channel):
     """What a learner did before the peak of its deviation decayed can leave a velocity error that nobody answers.
 
