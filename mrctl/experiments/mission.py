@@ -100,12 +100,10 @@ def _expected(folder: Path, order: Order, controller: str | None) -> Stages:
     Raises:
         InputError: The controller is not the one that drove it, or is refused, as by `user_files.load`.
     """
-    saved = _read(folder).get("controller")
+    saved = str(_read(folder).get("controller") or "")
     needed = f"--controller {shlex.quote(saved)}" if saved else "no --controller"
-    if controller is None and saved is None:
-        return {}
     stages: Stages = user_files.load(user_files.behind(controller)[1]) if controller else {}
-    fronts = [controller and user_files.behind(controller)[0], saved and user_files.behind(saved)[0]]
+    fronts = [user_files.behind(name)[0] if name else None for name in (controller, saved)]
     if fronts[0] != fronts[1] or named_stages(stages) != drove(folder, order):
         raise InputError(f"controller: {folder} needs {needed}, as when it was saved")
     return stages
