@@ -158,12 +158,14 @@ class LinearLoop:
         angles = np.pi / DIRECTIONS * np.arange(DIRECTIONS)
         directions = np.zeros((1 + DIRECTIONS, 3))
         directions[0, 0], directions[1:, 1], directions[1:, 2] = 1.0, np.cos(angles), np.sin(angles)
-        for doublings in range(self._doublings, MAX_DOUBLINGS + 1):
+        doublings = self._doublings
+        while True:
             errors = np.abs(directions @ self.response(self.pulse, doublings))
             sums, late = errors.sum(axis=1), errors[:, errors.shape[1] // 2 :].sum(axis=1)
             settled = late <= SETTLED * sums
-            if settled[0] and (settled[1:].all() or not self._holds_posture):
+            if doublings >= MAX_DOUBLINGS or settled[0] and (settled[1:].all() or not self._holds_posture):
                 break
+            doublings += 1
         velocity, posture = sums[0] if settled[0] else np.inf, sums[1:].max() if settled[1:].all() else np.inf
         between = np.cos(np.pi / (2 * DIRECTIONS))  # of the worst combination with the next one that is looked at
         return float(velocity), float(posture / between)

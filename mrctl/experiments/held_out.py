@@ -24,7 +24,7 @@ from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, interval
 from mrctl.experiments.tables import Table, frame, machine, number, output_folder, write_json
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.results.comparison import bootstrap_interval
+from mrctl.results.comparison import mean_interval
 from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.perturbation import Perturbation
@@ -220,7 +220,7 @@ def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
 def _standing(mine: Array, theirs: Array, floor: suite.Floor) -> dict[str, Any]:
     lost, lost_by_rival = (int((~np.isfinite(one)).sum()) for one in (mine, theirs))
     both = np.isfinite(mine) & np.isfinite(theirs)
-    difference = bootstrap_interval((mine - theirs)[both])._asdict()
+    difference = mean_interval((mine - theirs)[both])._asdict()
     close = not both.any() or difference["value"] <= floor.difference
     means = {"mine": float(mine[both].mean()), "theirs": float(theirs[both].mean())} if both.any() else {}
     return {

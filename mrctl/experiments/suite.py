@@ -40,7 +40,7 @@ from mrctl.loop.hindsight import REPETITIONS
 from mrctl.loop.runs import simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
-from mrctl.results.comparison import TIE, bootstrap_interval, cvar, paired_ratio, superiority, wilson
+from mrctl.results.comparison import TIE, cvar, mean_interval, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario, replicates
 from mrctl.sweep import jobs, store
@@ -239,10 +239,10 @@ def _statistics(
     if not any(event.reference for event in case.scenarios[0].events):
         until = case.back - 1 if case.back else case.scenarios[0].laps
         integral = metrics.excess(own, metric, case.change or 1, until).values
-        found["excess"] = bootstrap_interval(integral)._asdict()
+        found["excess"] = mean_interval(integral)._asdict()
     if case.part in UNCHANGED:
         laps = metrics.laps_to_converge(own, metric, RECOVERED_RATIO).values
-        found["laps_to_converge"] = bootstrap_interval(laps)._asdict()
+        found["laps_to_converge"] = mean_interval(laps)._asdict()
     if case.back:
         found |= _step(own, metric, case)
     return found
@@ -256,7 +256,7 @@ def windows(laps: xr.Dataset, metric: str) -> dict[str, Array]:
 
 def standing(name: str, errors: Mapping[str, Array], floor: Floor, median: bool) -> dict[str, Any]:
     """Returns the mean or median of one feedforward in a case, and compares it with the others in the same runs."""
-    found: dict[str, Any] = bootstrap_interval(errors[name], median=median)._asdict() | {"floor": floor._asdict()}
+    found: dict[str, Any] = mean_interval(errors[name], median=median)._asdict() | {"floor": floor._asdict()}
     for rival, theirs in errors.items():
         if rival != name:
             beaten = superiority(errors[name], theirs, floor=floor.tie)
@@ -340,7 +340,7 @@ def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
     needed = metrics.recovery_laps(laps, metric, case.change, case.back - 1, RECOVERED_RATIO).values
     worst = {f"{name}_worst": cvar(error[:, lap - 1] / before) for name, lap in after.items()}
     found["after_one_lap_to_settled"] = paired_ratio(error[:, case.change], settled)._asdict()
-    found["during"] = bootstrap_interval(settled)._asdict()
+    found["during"] = mean_interval(settled)._asdict()
     return found | worst | {"recovery_laps": needed.tolist(), "recovered_within_one_lap": float(np.mean(needed <= 1))}
 
 

@@ -17,7 +17,7 @@ import xarray as xr
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.results.comparison import Superiority, bootstrap_interval, wilson
+from mrctl.results.comparison import Superiority, mean_interval, wilson
 
 MIN_PAIRS = 6  # pairs that one which always wins needs for 95 % confidence: the exact sign test gives p = 0.03
 
@@ -90,11 +90,11 @@ def word_of(wins: Superiority, better: str, worse: str) -> str:
 
 
 def centre_cell(samples: Array, digits: int, median: bool = False) -> str:
-    """Returns the mean or the median of the finite samples with its 95 % interval, as from `bootstrap_interval`.
+    """Returns the mean or the median of the finite samples with its 95 % interval, as from `mean_interval`.
 
     The mean of one sample has no interval; – stands for no value, and for an end that is infinite.
     """
-    value, low, high, *_ = bootstrap_interval(samples, median=median)
+    value, low, high, *_ = mean_interval(samples, median=median)
     ends = (f"{end:.{digits}f}" if np.isfinite(end) else "–" for end in (low, high))
     interval = "" if np.isnan(low) else f" [{', '.join(ends)}]"
     return f"{value:.{digits}f}{interval}" if np.isfinite(value) else "–"

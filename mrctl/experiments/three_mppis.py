@@ -57,7 +57,7 @@ GATES, SPACING = 2, 2.0  # of the slalom; m
 CROSSINGS = (3.0, 5.0)  # m, where the discs cross the way, on average
 DISC_RADIUS = 0.2  # m, of the discs
 MAX_FITTED_LAG = 1.0  # s
-SIMULATED_PER_SECOND = 8  # simulated s in a s of one core
+SIMULATED_PER_SECOND = 2  # simulated s of plans in a s of one core; the runs take longer than their plans
 TIE = REACTIVE_PERIOD
 
 

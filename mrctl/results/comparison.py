@@ -61,7 +61,7 @@ class Superiority(NamedTuple):
     losses: int
 
 
-def bootstrap_interval(
+def mean_interval(
     samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0, *, median: bool = False
 ) -> Interval:
     """Returns the mean of the finite samples with its confidence interval.
@@ -100,7 +100,7 @@ def bootstrap_interval(
 def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
     """Returns the geometric mean of a / b over pairs (same seed, same perturbation), with its interval.
 
-    The interval is that of `bootstrap_interval` for the mean logarithm of the ratio. Every pair has the same weight,
+    The interval is that of `mean_interval` for the mean logarithm of the ratio. Every pair has the same weight,
     however large its errors, and the ratio of b to a is the inverse of that of a to b. A pair with an error of 0 has no
     such ratio and is left out.
 
@@ -112,13 +112,13 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
         seed: Seed of the resampling.
 
     Raises:
-        InputError: `a` and `b` differ in length, or as `bootstrap_interval`.
+        InputError: `a` and `b` differ in length, or as `mean_interval`.
     """
     first, second = _pairs(a, b)
     fine = np.isfinite(first), np.isfinite(second)
     both = fine[0] & fine[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = bootstrap_interval(np.log(first[both] / second[both]), level, n, seed)
+        mean = mean_interval(np.log(first[both] / second[both]), level, n, seed)
     value, low, high = np.exp(mean[:3]).tolist()
     return Ratio(value, low, high, mean.samples, int((~fine[0]).sum()), int((~fine[1]).sum()))
 

@@ -143,8 +143,8 @@ def test_suite_of_missions(cluster, tmp_path, monkeypatch):
     for part in (mission_suite, reactive_corridors, learned_limits):
         monkeypatch.setattr(part, "DRAWS", {"quick": 1})
     monkeypatch.setattr(mission_suite, "SPEEDS", (0.6,))
+    monkeypatch.setattr(mission_suite, "CONTROLLERS", ("none", "model"))
     for part in (mission_suite, reactive_corridors):
-        monkeypatch.setattr(part, "CONTROLLERS", ("none", "model"))
         monkeypatch.setattr(part, "PLANTS", {"nominal": part.PLANTS["nominal"]})
     monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
     monkeypatch.setattr(three_mppis, "WORLDS", {"quick": 1})

@@ -18,7 +18,7 @@ from mrctl.results import comparison
 def test_bootstrap_normal():
     """For many normal samples the interval is close to mean ± 1.96 s/√n."""
     samples = np.random.default_rng(1).normal(5, 2, 400)
-    found = comparison.bootstrap_interval(samples)
+    found = comparison.mean_interval(samples)
     half = 1.96 * samples.std(ddof=1) / 20
     assert found.value == pytest.approx(samples.mean())
     assert (found.low, found.high) == pytest.approx((samples.mean() - half, samples.mean() + half), abs=0.1 * half)
@@ -26,7 +26,7 @@ def test_bootstrap_normal():
 
 def test_median():
     """One run that went far wrong moves the mean and not the median, nor its interval."""
-    found = comparison.bootstrap_interval([1, 2, 3, 4, 5, 6, 7, 8, 700, np.nan], median=True)
+    found = comparison.mean_interval([1, 2, 3, 4, 5, 6, 7, 8, 700, np.nan], median=True)
     assert found == (5, 2, 8, 9, 1)
 
 
@@ -34,7 +34,7 @@ def test_median():
 def test_median_coverage(n):
     """At least 95 % of the intervals hold the median of a skew distribution, of few samples too."""
     draws = np.random.default_rng(5).lognormal(0, 0.6, (1000, n))
-    found = [comparison.bootstrap_interval(d, median=True) for d in draws]
+    found = [comparison.mean_interval(d, median=True) for d in draws]
     assert np.mean([one.low <= 1 <= one.high for one in found]) >= 0.95
     assert all(np.isfinite([one.low, one.high]).all() == (n > 5) for one in found)
 
@@ -42,7 +42,7 @@ def test_median_coverage(n):
 def test_bootstrap_coverage():
     """About 95 % of the intervals of 40 samples hold the true mean."""
     draws = np.random.default_rng(2).normal(3, 1, (200, 40))
-    found = (comparison.bootstrap_interval(d, n=500, seed=k) for k, d in enumerate(draws))
+    found = (comparison.mean_interval(d, n=500, seed=k) for k, d in enumerate(draws))
     held = [one.low <= 3 <= one.high for one in found]
     assert 0.89 <= np.mean(held) <= 0.99
 
@@ -51,7 +51,7 @@ def test_bootstrap_coverage():
 def test_few_samples(n):
     """About 95 % of the intervals of few samples hold the true mean, too; they are those of scipy."""
     draws = np.random.default_rng(4).normal(3, 1, (1000, n))
-    found = [comparison.bootstrap_interval(d) for d in draws]
+    found = [comparison.mean_interval(d) for d in draws]
     assert 0.93 <= np.mean([one.low <= 3 <= one.high for one in found]) <= 0.97
     expected = stats.t.interval(0.95, n - 1, draws[0].mean(), stats.sem(draws[0]))
     assert (found[0].low, found[0].high) == pytest.approx(expected)
@@ -59,12 +59,12 @@ def test_few_samples(n):
 
 def test_bootstrap_degenerate():
     """Constant samples have no width, one sample has no interval, NaN and inf are counted, and seeds repeat."""
-    assert comparison.bootstrap_interval([2, 2, 2]) == (2, 2, 2, 3, 0)
-    one = comparison.bootstrap_interval([2, np.nan])
+    assert comparison.mean_interval([2, 2, 2]) == (2, 2, 2, 3, 0)
+    one = comparison.mean_interval([2, np.nan])
     assert one.value == 2 and np.isnan(one.low) and (one.samples, one.failed) == (1, 1)
-    assert comparison.bootstrap_interval([1, 2, 4, np.nan, np.inf])[3:] == (3, 2)
-    assert np.isnan(comparison.bootstrap_interval([]).value)
-    assert comparison.bootstrap_interval([1, 2, 4], seed=3) == comparison.bootstrap_interval([1, 2, 4], seed=3)
+    assert comparison.mean_interval([1, 2, 4, np.nan, np.inf])[3:] == (3, 2)
+    assert np.isnan(comparison.mean_interval([]).value)
+    assert comparison.mean_interval([1, 2, 4], seed=3) == comparison.mean_interval([1, 2, 4], seed=3)
 
 
 def test_paired_ratio():
@@ -163,9 +163,9 @@ def test_cvar_by_hand():
 @pytest.mark.parametrize(
     ("call", "field"),
     [
-        (lambda: comparison.bootstrap_interval([1, 2], level=95), "level"),
+        (lambda: comparison.mean_interval([1, 2], level=95), "level"),
         (lambda: comparison.superiority([1, 2], [1, 2], level=0), "level"),
-        (lambda: comparison.bootstrap_interval(range(40), n=0), "n"),
+        (lambda: comparison.mean_interval(range(40), n=0), "n"),
         (lambda: comparison.paired_ratio([1, 2], [1]), "b"),
         (lambda: comparison.superiority([1], [1, 2]), "b"),
         (lambda: comparison.cvar([1], share=0), "share"),
