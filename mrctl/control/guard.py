@@ -13,7 +13,8 @@ deviations that cannot take e or ρ out of it are
 of what the two channels contribute. With the PIDs of the tiers D_ρ = D.
 
 A learner without a prior begins as PID alone, which lacks the whole voltage U of the model. Its error is no fault of
-the learner, so that ρ̄ is then |(‖G_ρ,1‖₁ max |U_1|, ‖G_ρ,2‖₁ max |U_2|)| where that is larger, up to 0.45 m.
+the learner, so that ρ̄ is then |(‖G_ρ,1‖₁ max |U_1|, ‖G_ρ,2‖₁ max |U_2|)| where that is larger, up to 0.45 m. Where it
+is larger, the third guarantee below is not derived.
 
 **Blame.** The guard keeps the peak of |d|, which decays with a time constant of 1 s. The learner is to blame for an
 error e if this peak exceeds D, for an error ρ if it exceeds D_ρ, and for an oscillation if it exceeds D/4. The voltage

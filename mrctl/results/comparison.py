@@ -85,6 +85,8 @@ def mean_interval(
     Raises:
         InputError: The level is not between 0 and 1, or there is no resample.
     """
+    if n < 1:
+        raise InputError(f"n: {n} is below 1")
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
     value = float((np.median if median else np.mean)(finite)) if len(finite) else np.nan
@@ -272,8 +274,6 @@ def _bootstrapped(samples: Array, level: float, n: int, seed: int) -> tuple[floa
     from scipy.stats import bootstrap  # the import takes 0.4 s
 
     _check_level(level)
-    if n < 1:
-        raise InputError(f"n: {n} is below 1")
     low = high = np.nan
     for method in ("BCa", "percentile"):
         with warnings.catch_warnings(), np.errstate(all="ignore"):
