@@ -169,9 +169,11 @@ def filter_twice(signal: Array, once: Array, twice: Array, share: float, begins:
 def filter_motion(shown: Shown, robot: Row, s: Row) -> None:
     """Passes voltage, twist and heading through the two filters, and estimates the noise of the twist.
 
-        V̇_f = (once − twice)/T,    var V = mean (V_n − 2 V_n−1 + V_n−2)²/6
+        V̇_f = (once − twice)/T,    V_f = twice − V̇_f h/2,    var V = mean (V_n − 2 V_n−1 + V_n−2)²/6
 
-    The second difference of independent noise has six times the variance of that noise.
+    The voltage acts in the period that ends now, over which V̇_f is the difference quotient of the second filter's
+    output, and V_f the mean. With V at its end the inertia found would be too small by c_V h/2. The second difference
+    of independent noise has six times the variance of that noise.
     """
     twist, now, once, twice = shown.twist, s.now, s.once, s.twice
     now.twist[0], now.twist[1] = twist[0], twist[1]
@@ -186,6 +188,7 @@ def filter_motion(shown: Shown, robot: Row, s: Row) -> None:
         s.variance[k] += s.lasting * (difference * difference / 6 - s.variance[k])
         s.last[1, k], s.last[0, k] = s.last[0, k], twist[k]
         s.rate[k] = (once.twist[k] - twice.twist[k]) * s.filter / (1 - s.filter) / shown.period
+        s.motion[k] = twice.twist[k] - s.rate[k] * shown.period / 2
         now.voltage[k] = sent(k, shown, robot.rigid)
     s.age += s.filter
 
@@ -212,14 +215,13 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
     answered = recall(s.phi_c, queue[i], s)
     filter_motion(shown, robot, s)
     added[0] = added[1] = 0.0
-    motion = s.twice
-    moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > STICTION_SPEED
+    moves = abs(s.motion[0]) + robot.half_track * abs(s.motion[1]) > STICTION_SPEED
     if moves and s.age > SETTLING_TIMES and shown.frozen == 0:
-        regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
+        regressor(s.motion, s.rate, s.twice.direction, robot.half_track, scale, s.phi)
         s.phi[REGRESSORS] = 1.0
-        explained(motion.twist, s.rate, robot.rigid, prior, s.residual)
+        explained(s.motion, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
-            s.residual[k] = motion.voltage[k] - s.residual[k]
+            s.residual[k] = s.twice.voltage[k] - s.residual[k]
             added[k] = learned_voltage(s.a[k], s.phi_c)
             predict(k, s)
             if answered:
@@ -290,7 +292,8 @@ COMPOSITE = np.dtype(
         ("twice", FILTERED),  # output of the second filter
         ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
         ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
-        ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
+        ("rate", "f8", CHANNELS),  # filtered acceleration V̇_f, m/s² and rad/s²
+        ("motion", "f8", CHANNELS),  # mean V_f of the filtered twist over the last period, m/s and rad/s
         ("phi", "f8", REGRESSORS + 1),  # (φ, 1) at the filtered motion
         ("phi_c", "f8", REGRESSORS + 1),  # (φ, 1) at the command
         ("tick", "i8"),  # number of ticks so far

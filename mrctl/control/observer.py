@@ -36,7 +36,9 @@ def observe(shown: Shown, rigid: bool, prior: Row, s: Row) -> None:
 
         d̂ = Q (U − c · x|V̇=ω̇=0) − c_V̇ (V − Q V)/T − c_ω̇ (ω − Q ω)/T
 
-    Q = 1/(T s + 1) is discretised by implicit Euler, for which Q of the difference quotient of V is (V − Q V)/T.
+    Q = 1/(T s + 1) is discretised by implicit Euler, for which Q of the difference quotient of V is (V − Q V)/T. U and
+    the quotient belong to the period that ends now, and so does c · x, of which the mean of its two ends is taken: with
+    the end alone, d̂ would contain c_V V̇ h/2.
 
     Args:
         shown: What this tick shows of the robot.
@@ -46,10 +48,12 @@ def observe(shown: Shown, rigid: bool, prior: Row, s: Row) -> None:
     """
     twist, share = shown.twist, shown.period / (s.time_constant + shown.period)
     s.rate[0] = s.rate[1] = 0.0
+    for k in range(2):
+        s.before[k] = s.steady[k]
     explained(twist, s.rate, rigid, prior, s.steady)
     for k in range(2):
         if s.started:
-            s.voltage[k] += share * (s.sent[k] - s.steady[k] - s.voltage[k])
+            s.voltage[k] += share * (s.sent[k] - (s.before[k] + s.steady[k]) / 2 - s.voltage[k])
             s.twist[k] += share * (twist[k] - s.twist[k])
             s.rate[k] = (twist[k] - s.twist[k]) / s.time_constant
         else:
@@ -93,6 +97,7 @@ OBSERVER = np.dtype(
         ("disturbance", "f8", 2),  # d̂ of the two channels, V
         ("started", "?"),  # whether there was a last period
         ("steady", "f8", 2),  # voltage of the model at the measured twist, without acceleration, V
+        ("before", "f8", 2),  # the same one period ago, V
         ("rate", "f8", 2),  # Q of its acceleration, m/s² and rad/s²
     ],
     align=True,

@@ -14,6 +14,7 @@ ALLOCATION = np.dtype(
     [
         ("angle", "f8"),  # steering angle φ_c of the fork at the end of the last period, rad
         ("rate", "f8"),  # its rate, rad/s
+        ("lag", "f8"),  # lag of the fork at the end of the last period, s
         ("feedback", "f8", 2),  # part of the voltages left and right that comes from feedback, V
         ("feedforward", "f8", 2),  # part from feedforward, V; it includes the differential of `rigid` steering
         ("command", "f8", 4),  # voltages left and right in V, steering angle in rad, steering rate in rad/s
@@ -37,8 +38,9 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
     there: with a trail the contact is dragged sideways where φ_c changes, and θ̇ answers as (1 − s t/speed)/(1 + s
     t/speed), like a delay of 2 t/speed. Robots that come with mrctl have no trail where they can reverse.
 
-    The rate is the derivative of φ_c behind the same lag. It therefore leaves out how the fork catches up where φ_c
-    jumps: when a robot leaves rest on an arc, the rate is that of the angle only some lags later.
+    The rate r is the derivative of φ_c behind the same lag, d/dt (lag r) + r = φ̇_c. It therefore leaves out how the
+    fork catches up where φ_c jumps: when a robot leaves rest on an arc, the rate is that of the angle only some lags
+    later.
 
     Args:
         v: V in m/s.
@@ -63,7 +65,8 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
     static_dot -= (sense * robot.trail * omega_dot - sine * speed_dot) / speed / np.sqrt(1 - sine * sine)
     lag = robot.trail / speed
     s.angle = (lag * s.angle + period * static) / (lag + period)  # implicit Euler: exact on a ramp
-    s.rate = (lag * s.rate + period * static_dot) / (lag + period * (1 - lag * speed_dot / speed))
+    s.rate = (s.lag * s.rate + period * static_dot) / (lag + period)
+    s.lag = lag
 
 
 @kernel

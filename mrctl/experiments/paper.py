@@ -45,7 +45,7 @@ IDEAL: dict[str, Any] = {
     "prefilter": 0.05,
     "fel": Fel(step=0.1),
     "observer": Observer(time_constant=0.055),
-    "composite": Composite(disturbance=0.15, step=0.025),
+    "composite": Composite(noise=0.07, disturbance=0.15, step=0.025),
 }
 """The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit.
 

@@ -423,7 +423,8 @@ class Hierarchy:
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Bumpless start: the integral holds the voltage that the nominal robot needs for its initial motion.
 
-        Where the learner starts from a file, it holds nothing: it would cancel what was learned of the robot.
+        Where the feedforward knows the robot, from a file or because the prior is `true_model`, the integral holds
+        nothing: it would cancel what is known.
 
         Args:
             twist: Initial twist of the robots in m/s and rad/s, `(B, 2)`.
@@ -433,8 +434,8 @@ class Hierarchy:
         """
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        learned = np.array([own.learned is not None for own in self.settings])
-        self.state["pid"]["integral"][rows] = np.where(learned[:, None], 0.0, self.steady(twist, acceleration))[rows]
+        knows = np.array([self._knows_truth or own.learned is not None for own in self.settings])
+        self.state["pid"]["integral"][rows] = np.where(knows[:, None], 0.0, self.steady(twist, acceleration))[rows]
 
     def steady(self, twist: Array, acceleration: Array) -> Array:
         """Returns the voltage that the nominal robot needs for a motion, less that of the feedforward, `(B, 2)`."""

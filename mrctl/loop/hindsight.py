@@ -63,10 +63,7 @@ def drive(scenarios: Sequence[Scenario], coefficients: Array | None, threads: in
     hierarchy = simulation.hierarchy
     prior = hierarchy.prior.rows
     if coefficients is not None:
-        prior["c"] = coefficients
-        # Starts anew, because these coefficients leave another voltage to the PID's integral.
-        reference, _ = simulation.courses.at(0)
-        hierarchy.reset(reference["twist"], reference["acceleration"], simulation.plant.reading["steering_angle"])
+        prior["c"] = coefficients  # the PID's integral is still zero, that of the nominal model
     gram, seen = np.zeros((len(scenarios), 8, 8)), np.zeros((len(scenarios), 8, 2))
     while simulation.running:
         simulation.step()

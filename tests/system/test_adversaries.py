@@ -257,9 +257,12 @@ def test_guarantee(steering, world):
     """The worst learner within D keeps the errors in the region, and one beyond it what the loops recover from.
 
     The linear loops bound the posture error by ρ̄ and the position error by `recovery`; the limits on acceleration and
-    the turns of the lemniscate add to them, most of all under rigid steering with the slow PID of the paper.
+    the turns of the lemniscate add to them, most of all under rigid steering with the slow PID of the paper. In `lab`
+    the noise adds to the worst of three frequencies, in the worst of three draws up to a tenth.
     """
-    base = scenario(steering, world, 0, laps=1, initial_spread=(0, 0, 0), learner="none")
+    seeds = range(3 if world == "lab" else 1)
+    bases = [scenario(steering, world, seed, laps=1, initial_spread=(0, 0, 0), learner="none") for seed in seeds]
+    base = bases[0]
     rigid, delay = steering == "rigid", base.sensing.periods("delay", PERIOD) * PERIOD
     _, robot = mjcf.build(base.world, steering, base.physics_step, base.robot)
     gains = base.pid.channels(robot, rigid, delay, PERIOD)
@@ -280,21 +283,23 @@ def test_guarantee(steering, world):
 
     class Worst(Adversary):
         def __init__(self, nominal, size):
-            super().__init__(["bang-bang"] * size, [0, 1, 2] * 2, nominal, rigid, (10, 20))
-            self.on = shares[:, None] * within
-            self.size[:], self.begin[:], self.frequency[:] = 1.0, 1.0, np.tile(frequencies, 2)
+            super().__init__(["bang-bang"] * size, [0, 1, 2] * (size // 3), nominal, rigid, (10, 20))
+            self.on = np.tile(shares, len(seeds))[:, None] * within
+            self.size[:], self.begin[:], self.frequency[:] = 1.0, 1.0, np.tile(frequencies, size // 3)
 
     guards = [{"on": share > 1, "growth": 100.0} for share in shares]  # the guard ends oscillations
-    runs = simulate([base.replace(guard=guard) for guard in guards], feedforward=Worst)
+    runs = simulate([one.replace(guard=guard) for one in bases for guard in guards], feedforward=Worst)
     assert not runs.failed.any()
-    calm, wild = runs.isel(run=slice(3)), runs.isel(run=slice(3, None))
+    beyond = np.tile(shares > 1, len(seeds))
+    calm, wild = runs.isel(run=~beyond), runs.isel(run=beyond)
     position = np.hypot(calm.x - calm.x_ref, calm.y - calm.y_ref)
     posture = np.hypot(position, HEADING_ARM * np.angle(np.exp(1j * (calm.theta - calm.theta_ref))))
     slack = 1.5 if (steering, world) == ("rigid", "paper") else 1.0
     assert posture.values.max() < slack * TOLERATED_POSTURE
     if not rigid:
         velocity = np.stack([calm.v_command - calm.v, calm.omega_command - calm.omega], axis=-1)
-        assert (np.abs(velocity).max(axis=(0, 1)) < 1.05 * region).all()
+        largest = np.abs(velocity).reshape(len(seeds), -1, 2).max(axis=1)
+        assert (np.median(largest, axis=0) < 1.05 * region).all() and (largest < 1.1 * region).all()
     assert position.values.max() < bound
     assert np.hypot(wild.x - wild.x_ref, wild.y - wild.y_ref).values.max() < 1.5 * bound
 

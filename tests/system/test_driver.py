@@ -62,10 +62,10 @@ def test_hard_limit(feedforward):
 
 def test_hard_limit_with_predictions():
     """`composite` need not be told: its error is the same within a tenth, and the guard leaves it alone."""
-    untold, _ = limited("model+composite", 1.3, 12.0, 3, [0], told=False)
-    told, guarded = limited("model+composite", 1.3, 12.0, 3, [0], told=True, guard=True)
-    assert told == pytest.approx(untold, rel=0.1) and told < 3.5
-    assert guarded == 0
+    untold, _ = limited("model+composite", 1.3, 12.0, 3, range(6), told=False)
+    told, guarded = limited("model+composite", 1.3, 12.0, 3, range(6), told=True, guard=True)
+    assert np.median(told) == pytest.approx(np.median(untold), rel=0.1) and told.max() < 3.5
+    assert not guarded.any()
 
 
 def same(one, other):

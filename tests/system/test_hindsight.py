@@ -87,6 +87,20 @@ def test_fit(steering):
             assert (fitted.position_rmse.values < 1.1 * other.position_rmse.values).all()
 
 
+def test_starts_as_good_as_it_goes_on():
+    """Whoever knows the robot knows it from the first second on: no integral of the nominal robot is in the way."""
+    group = [BASE.replace(**FEEDFORWARDS["model"], initial_spread=(0, 0, 0))]
+    true = simulate(group[0].replace(prior="true_model"))
+    second = slice(0, round(1 / group[0].control_period))
+    start, whole, model = (
+        np.hypot(run.x - run.x_ref, run.y - run.y_ref).values.ravel()[part]
+        for run, part in ((true, second), (true, slice(None)), (first(*group)[0], second))
+    )
+    assert start.max() < 1.05 * whole[second.stop :].max() and start.max() < model.max() / 4
+    fitted = twice_fitted(group)
+    assert np.hypot(fitted.x - fitted.x_ref, fitted.y - fitted.y_ref).values.ravel()[second].max() < model.max() / 4
+
+
 def test_best_of_its_drives(monkeypatch):
     """Of the model and what is fitted each run has the better one; runs of two kinds keep their order.
 

@@ -44,6 +44,28 @@ def test_step(robot):
     np.testing.assert_allclose(found[-1], lost, rtol=0.02)
 
 
+@pytest.mark.parametrize("period", [0.01, 0.05])
+def test_sees_nothing_while_the_model_accelerates(robot, period):
+    """On the nominal plant it finds no disturbance, although a sampled voltage acts during a whole period.
+
+    The plant is the common channel without friction, whose motion between two samples is exact.
+    """
+    plant = robot.model_copy(update={"no_load_current": 0.0, "gear_loss": 0.0, "rolling_coefficient": 0.0})
+    stage = DisturbanceObserver(Loop(plant, False, period), [Observer()])
+    stage.prior = Prior([plant], False)
+    c = stage.prior.rows["c"][0, :, 0]
+    speed, inertia = c[0], c[2]
+    v, log, rates = 0.5, [], []
+    for tick in range(round(4.0 / period)):
+        voltage = 12.0 + 6.0 * np.sin(4.0 * period * tick)
+        stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[v, 0.0]]), np.array([[voltage, 0.0]]))
+        log.append(stage.rows["disturbance"][0, 0])
+        rates.append((voltage - speed * v) / inertia)
+        v = voltage / speed + (v - voltage / speed) * np.exp(-speed * period / inertia)
+    half_period = speed * period / 2 * np.abs(rates).max()
+    assert np.abs(log).max() < 0.05 * half_period
+
+
 @pytest.mark.parametrize("ratio", [0.2, 1.0])
 def test_bandwidth(robot, ratio):
     """A disturbance that swings at ω is found with the gain and phase of 1/(1 + jωT)."""

@@ -85,6 +85,26 @@ def test_rate(robot, trail, tolerance):
     assert command[3] != 0
 
 
+@pytest.mark.parametrize("period", [0.02, 0.05, 0.1])
+def test_rate_as_a_robot_leaves_rest(robot, period):
+    """The rate of the fork on an arc from rest is that of fine steps, however long the control period is.
+
+    The lag t/speed then shrinks by a large factor from one period to the next.
+    """
+
+    def rates(step):
+        allocation, found = Allocation(robot, period=step), []
+        for tick in range(round(1.0 / step)):
+            v, v_dot = 1.5 * step * (tick + 1), 1.5
+            omega = 0.5 * np.sin(3 * v) * v  # the curvature grows with the way
+            allocation([v, omega], [v_dot, (0.5 * np.sin(3 * v) + 1.5 * np.cos(3 * v) * v) * v_dot])
+            found.append(allocation.rate)
+        return np.array(found)
+
+    exact = rates(period / 200)[199::200]
+    np.testing.assert_allclose(rates(period), exact, atol=0.25 * np.abs(exact).max())
+
+
 def test_contact_rolls(robot):
     """Along a lemniscate the swinging contact is not dragged sideways: sin(direction − φ)·speed = t (θ̇ + φ̇)."""
     h = 1e-3
