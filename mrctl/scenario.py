@@ -34,18 +34,19 @@ MODEL_BASED = tuple(name for name, law in LEARNERS.items() if law.needs_model)
 """Learners that compare the robot with a model, so that the prior must be a model."""
 
 
-def feedforward_name(prior: str, learner: str) -> str:
-    """Returns the name of a feedforward in tables: `none`, `model`, `fel`, or `model+fel` for both."""
-    return "+".join(part for part in (prior, learner) if part != "none") or "none"
+def controller_name(*parts: str) -> str:
+    """Returns the name of a controller in tables, from those of prior, learner and the user's stages.
+
+    `none` is left out if there is anything else: `none`, `model`, `fel`, `model+fel`, `PurePursuit`, `fel+PurePursuit`.
+    """
+    return "+".join(part for part in parts if part != "none") or "none"
 
 
 FeedforwardName = Literal[
     "none", "model", "true_model", "model+observer", "model+indi", "model+l1", "fel", "model+fel", "rls", "model+rls",
     "mrac", "model+mrac", "composite", "model+composite",
 ]  # fmt: skip
-_PAIRS = {
-    feedforward_name(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)
-}
+_PAIRS = {controller_name(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)}
 FEEDFORWARDS: dict[FeedforwardName, dict[str, Any]] = {name: _PAIRS[name] for name in get_args(FeedforwardName)}
 """Pairs of a prior and a learner, as fields of a scenario, by their names."""
 COMPARED: tuple[FeedforwardName, ...] = tuple(
@@ -229,7 +230,7 @@ class Scenario(Record):
     @property
     def feedforward(self) -> str:
         """Name of prior and learner in tables."""
-        return feedforward_name(self.prior, self.learner)
+        return controller_name(self.prior, self.learner)
 
     @property
     def duration(self) -> float:

@@ -12,7 +12,7 @@ from mrctl.cli.arguments import CONTROLLER_OF_VIEW, NOT_OF_MISSIONS, fields_set
 from mrctl.cli.flags import EXPLAINED_FIELDS, is_short_help, partial_record
 from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, show, warn_if_impossible
 from mrctl.record import InputError, Record
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, feedforward_name
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, controller_name
 
 DEFAULTS = {
     "prior": "model, or none where --learner is given",
@@ -151,7 +151,7 @@ def _fronted(controller: str, scenario: Scenario, chosen: bool) -> Scenario:
     front, own, parts = user_files.behind(controller)
     if chosen:
         has_own = any(part.stage == "feedforward" for part in parts)
-        wanted = feedforward_name(scenario.prior, "none" if has_own else scenario.learner)
+        wanted = controller_name(scenario.prior, "none" if has_own else scenario.learner)
         form = own if wanted == "none" else f"{wanted}+{own}"
         raise InputError(f"controller: leave --prior and --learner out, and write {form}")
     return scenario.replace(**FEEDFORWARDS[front])

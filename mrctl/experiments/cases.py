@@ -15,7 +15,7 @@ from mrctl.loop import user_files
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
-from mrctl.scenario import COMPARED, FEEDFORWARDS, Event, FeedforwardName, Scenario, feedforward_name, replicates
+from mrctl.scenario import COMPARED, FEEDFORWARDS, Event, FeedforwardName, Scenario, controller_name, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, StopAndGo, Waypoints, random_spline
@@ -173,7 +173,7 @@ def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str], base: Sce
     choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
     for entry in controllers:
         front, stages, parts = user_files.behind(entry)
-        name = feedforward_name(front, "+".join(part.title for part in parts))
+        name = controller_name(front, "+".join(part.title for part in parts))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
         own = user_files.absolute(stages)

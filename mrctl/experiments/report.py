@@ -29,7 +29,7 @@ from mrctl.loop.user_stages import StageError
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
-from mrctl.scenario import MODEL_BASED, Scenario, feedforward_name
+from mrctl.scenario import MODEL_BASED, Scenario, controller_name
 
 WITHOUT_MAP = ("none", *MODEL_BASED)
 """Learners without a map from motion to voltage."""
@@ -214,7 +214,7 @@ def command(outcome: Outcome, choices: Choices) -> str:
 def controllers(choices: Choices) -> list[str]:
     """Returns the user's controllers, as on the command line."""
     return [
-        feedforward_name(feedforward_name(one.prior, one.learner), one.controller)
+        controller_name(controller_name(one.prior, one.learner), one.controller)
         for one in choices.values()
         if one.controller
     ]

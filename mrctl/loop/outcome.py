@@ -18,7 +18,7 @@ from mrctl.loop.user_stages import StageError, UserFeedforward
 from mrctl.physics import hull
 from mrctl.physics.plant import Plant
 from mrctl.results import dataset
-from mrctl.scenario import Scenario, feedforward_name
+from mrctl.scenario import Scenario, controller_name
 from mrctl.sensing.estimators import Estimator
 from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
@@ -26,15 +26,15 @@ from mrctl.theory.obstacles import Surroundings
 
 
 def titles(scenario: Scenario, stages: Mapping[str, str]) -> tuple[str, str]:
-    """Returns the label of a run that has no name, and the name of its feedforward.
+    """Returns the name of a run's controller, which is the label of a run without name, and that of its feedforward.
 
     Args:
         scenario: The run.
         stages: Names of the user's factories by stage.
     """
     others = dict(stages)
-    feedforward = feedforward_name(scenario.prior, others.pop("feedforward", scenario.learner))
-    return " + ".join([feedforward, *others.values()]), feedforward
+    feedforward = controller_name(scenario.prior, others.pop("feedforward", scenario.learner))
+    return controller_name(feedforward, *others.values()), feedforward
 
 
 class Outcome:

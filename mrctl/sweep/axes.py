@@ -11,7 +11,7 @@ import pyarrow as pa
 from pydantic import Field, model_validator
 
 from mrctl.record import InputError, Record
-from mrctl.scenario import FEEDFORWARDS, feedforward_name
+from mrctl.scenario import FEEDFORWARDS, controller_name
 
 SCENARIO_FIELD = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 CONTROLLER_FIELD = "controller"  # the field of an axis whose values say what drives
@@ -42,7 +42,7 @@ class Chosen(NamedTuple):
 
         front, own, parts = user_files.behind(value)
         says = front != "none" or any(part.stage == "feedforward" for part in parts)
-        title = feedforward_name(front, "+".join(part.title for part in parts))
+        title = controller_name(front, "+".join(part.title for part in parts))
         return cls(title, own, FEEDFORWARDS[front] if says else {})
 
 

@@ -62,8 +62,8 @@ class Recording:
         self.scenario: Scenario = scenarios_of(run)[0]
         self.controller = str(run["feedforward"].values) if "feedforward" in run.coords else self.scenario.feedforward
         label = str(run["label"].values)
-        name, plus, stages = label.partition(" + ")  # of the user
-        self.label = title_of(name) + plus + stages if name == self.controller else label
+        title, stages = title_of(self.controller), label.removeprefix(self.controller + "+")  # of the user
+        self.label = title if label == self.controller else label if stages == label else f"{title} + {stages}"
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
         log = blank(run.sizes["time"])

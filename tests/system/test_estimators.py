@@ -507,7 +507,7 @@ def test_own_odometry():
     found = simulate(LANES, estimator=Odometry)
     same(found, builtin)
     same(simulate(LANES[1], estimator=Odometry), builtin.isel(run=1))
-    assert (found.estimator_fault == "").all() and str(found.label[0].item()) == "none + Odometry"
+    assert (found.estimator_fault == "").all() and str(found.label[0].item()) == "Odometry"
 
 
 def test_the_design_knows_late_sensors():

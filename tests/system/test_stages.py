@@ -307,7 +307,7 @@ def test_scans():
 def test_stanley():
     """A published motion controller in a few lines drives the robot, and the label of the result names it."""
     run = simulate(LAP, motion=Stanley)
-    assert not run.failed and str(run.label.item()) == "fel + Stanley" and str(run.feedforward.item()) == "fel"
+    assert not run.failed and str(run.label.item()) == "fel+Stanley" and str(run.feedforward.item()) == "fel"
     assert float(np.hypot(run.longitudinal_error, run.lateral_error)[-200:].max()) < 0.1
 
 
@@ -519,7 +519,7 @@ def test_settings_in_the_label():
             super().__init__(robot, size)
 
     labels = [str(simulate(SHORT, motion=partial(Tuned, gain=g, name="a,b")).label.values) for g in (0.5, 2.0)]
-    assert labels == [f"none + Tuned(gain={g}, name='a,b')" for g in (0.5, 2.0)]
+    assert labels == [f"Tuned(gain={g}, name='a,b')" for g in (0.5, 2.0)]
 
 
 def test_command_line(tmp_path, capsys):
