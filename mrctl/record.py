@@ -270,6 +270,9 @@ class Record(BaseModel, metaclass=_Constructors):
         """Returns the fields as TOML that `from_toml` reads back, with one line for each that is not None.
 
         The first line is a comment with the version of mrctl. A list of records has one line for each of its elements.
+
+        Raises:
+            InputError: A list contains None, which TOML cannot say.
         """
         return f"{WRITTEN_BY}{__version__}\n" + "".join(
             f"{name} = {_toml(value, nested=False)}\n"
@@ -280,7 +283,10 @@ class Record(BaseModel, metaclass=_Constructors):
 def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
     """Returns a value as TOML; numbers, booleans and strings are written as in JSON, and DEL is escaped."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+        given = {key: item for key, item in value.items() if item is not None}
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in given.items()) + " }"
+    if value is None:
+        raise InputError("values: a list contains None, which TOML cannot say; write JSON, or leave the value out")
     if isinstance(value, list) and not nested and any(isinstance(item, dict) for item in value):
         return "[\n" + "".join(f"    {_toml(item)},\n" for item in value) + "]"
     if isinstance(value, list):

@@ -256,10 +256,12 @@ def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]
         first: Seed of the first replicate.
 
     Raises:
-        InputError: The first seed is negative, or a drawn perturbation is beyond its limits.
+        InputError: There are no replicates, one would have no valid seed, or a drawn perturbation is beyond its limits.
     """
-    if first < 0:
-        raise InputError(f"first: {first} is below 0, and no seed is")
+    if count < 1:
+        raise InputError(f"count: {count} is below 1")
+    if first < 0 or first + count > 2**32:
+        raise InputError(f"first: {first} to {first + count - 1} are not between 0 and {2**32 - 1}, as seeds are")
     found = []
     for draw in range(first, first + count):
         events = tuple(

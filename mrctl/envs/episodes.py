@@ -29,7 +29,7 @@ OBSERVATIONS: dict[str, int] = {
 θ̇ (m/s, rad/s); V and θ̇ of the reference with their derivatives; rates of the rear wheels from the encoders (rad/s);
 commanded steering angle (rad); voltages sent last (V)."""
 EPISODE_METRICS = ("v_rmse", "omega_rmse", "position_rmse")
-"""Metrics at the end of an episode, root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
+"""Metrics of an episode, root mean squares over all its laps as of `results.metrics.over_laps`: m/s, rad/s and m."""
 MAX_SEEDS = 2**32  # number of seeds that a scenario can have
 MAX_RESIDUAL = 0.25  # largest residual, as a share of the supply
 HALF_REWARD_DISTANCE = 0.05  # distance from the reference in m at which the reward is a half
@@ -37,8 +37,8 @@ HALF_REWARD_DISTANCE = 0.05  # distance from the reference in m at which the rew
 
 @kernel
 def observe(
-    plant: Rows, seen: Rows, wanted: Rows, now: Rows, control: Rows, radius: float, half_track: float,
-    observation: Array, reward: Array,
+    plant: Rows, seen: Rows, wanted: Rows, now: Rows, control: Rows, there: NDArray[np.bool], radius: float,
+    half_track: float, observation: Array, reward: Array,
 ) -> None:  # fmt: skip
     """Computes what `Episodes.observe` returns, from the `PLANT`, `SEEN`, `REFERENCE` and `CONTROL` of each robot.
 
@@ -55,7 +55,7 @@ def observe(
         out[11] = control[i].allocation.angle
         x, y, theta = error[0], error[1], half_track * error[2]
         reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / HALF_REWARD_DISTANCE**2)
-        if p.stopped:
+        if p.stopped and not there[i]:
             reward[i] = 0.0
             for k in range(len(out)):  # the state may have diverged
                 if not np.isfinite(out[k]):
@@ -96,7 +96,8 @@ class Episodes:
     - `voltage`: the voltages left and right in V, in place of both controllers; the steering follows the reference.
     - `residual`: voltages left and right in V that are added to those of the controllers, cut off at `bound`.
 
-    With voltages `pid.retune` of the scenarios is False: what an agent does to them is no oscillation of a loop.
+    With voltages `pid.retune` of the scenarios is False, for `simulate` too if it is to have the same bits: what an
+    agent does to them is no oscillation of a loop.
 
     Attributes:
         loop: The simulation, of which this class takes a tick apart: `sense`, `send`, the physics, `settle`.
@@ -126,7 +127,7 @@ class Episodes:
             action: Meaning of an action, as above.
             draw: Draws the perturbation of every episode, in place of the scenario's, from a generator that the
                 episode's seed determines; with `scenario.perturbation.drawn` the episode of seed k is replicate k of
-                `replicates`.
+                `replicates`, if no event changes the perturbation.
             threads: Number of threads of the batch engine; 0 for all cores.
 
         Raises:
@@ -208,9 +209,13 @@ class Episodes:
         Raises:
             InputError: The perturbation is invalid, or the robot could not stand.
         """
+        self._begin(row, self._next(row, seed, perturbation))
+
+    def _begin(self, row: int, scenario: Scenario) -> None:
+        """Begins an episode of one robot with a scenario of `_next`."""
         if len(self.scenarios) == 1:
             self.loop.hierarchy.restart_clock()
-        self.loop.restart(row, self._next(row, seed, perturbation))
+        self.loop.restart(row, scenario)
         self.start[row] = self.tick
         self._action[row] = self._squares[row] = 0.0
 
@@ -226,8 +231,9 @@ class Episodes:
         perturbations = [None] * len(seeds) if perturbations is None else perturbations
         if len(perturbations) != len(seeds):
             raise InputError(f"perturbation: {len(perturbations)} of them for {len(seeds)} robots")
-        for row, seed in enumerate(seeds):
-            self.begin(row, seed, perturbations[row])
+        coming = [self._next(row, seed, perturbations[row]) for row, seed in enumerate(seeds)]
+        for row, scenario in enumerate(coming):  # where one is refused, no robot has begun
+            self._begin(row, scenario)
 
     def act(self, action: Array, scale: Array | float = 1.0) -> None:
         """Sets the action of the coming tick, `(B, 2)`, or `(2,)` for one robot, times a scale.
@@ -277,7 +283,8 @@ class Episodes:
         now, _ = loop.courses.at(self.tick)
         constants = robot.wheel_radius, robot.half_track
         observation, reward = np.empty((size, sum(OBSERVATIONS.values()))), np.empty(size)
-        observe(self.plant.state, seen, wanted, now, loop.hierarchy.state, *constants, observation, reward)
+        there = loop.goals.there
+        observe(self.plant.state, seen, wanted, now, loop.hierarchy.state, there, *constants, observation, reward)
         return observation, reward
 
     def settle(self) -> None:

@@ -3,7 +3,8 @@
 The import of this module registers `mrctl/TwistTracking-v0`, `mrctl/VoltageTracking-v0`, `mrctl/ResidualTracking-v0`
 and `mrctl/Navigation-v0`. An action is that of `mrctl.envs.episodes.Episodes` divided by `bound`, so that it lies
 between −1 and 1. An observation holds the parts in `sizes` one after another. The seed of a reset becomes the seed of
-the scenario: the episode has the same bits as `simulate` with that seed.
+the scenario: where the action adds nothing, the episode has the same bits as `simulate` with that seed and
+`pid.retune` off.
 """
 
 from __future__ import annotations
@@ -110,6 +111,7 @@ class TrackingEnv(gymnasium.Env):
 
         Raises:
             InputError: An option is unknown or invalid, or no scenario can have the seed.
+            gymnasium.error.Error: The seed is negative or no integer.
         """
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(MAX_SEEDS))
@@ -235,7 +237,7 @@ class TrackingVectorEnv(VectorEnv):
         if isinstance(seed, np.ndarray | np.integer):
             seed = seed.tolist()
         if isinstance(seed, Sequence):
-            seeds = list(seed)
+            seeds = [own.item() if isinstance(own, np.integer) else own for own in seed]
             if len(seeds) != self.num_envs:
                 raise InputError(f"seed: {len(seeds)} seeds for {self.num_envs} robots")
         else:

@@ -103,7 +103,7 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
         ends = {name: metrics.summary(own)["position_rmse"].to_numpy() for name, own in found["random"].items()}
         ratios = {name: end / ends["none"] for name, end in ends.items()}
         drawn["random"] = (
-            plots.distributions(ratios, "position error over that of PID, same run"),
+            plots.distributions(ratios, "position error over that of PID, same run", mark=1),
             "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve ends "
             "below 1 by the share of runs that it or PID alone lost.",
         )

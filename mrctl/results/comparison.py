@@ -141,9 +141,11 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
             such as `TIE["position_rmse"]`. With 0, differences that half the time step reverses count as wins.
 
     Raises:
-        InputError: `a` and `b` differ in length, or the level is not between 0 and 1.
+        InputError: `a` and `b` differ in length, the level is not between 0 and 1, or the floor is negative or NaN.
     """
     _check_level(level)
+    if not floor >= 0:
+        raise InputError(f"floor: {floor} is not 0 or more")
     first, second = (np.where(np.isfinite(one), one, np.inf) for one in _pairs(a, b))
     tied = first == second
     with np.errstate(invalid="ignore"):  # inf − inf of two failures, which tie already
@@ -172,6 +174,8 @@ def clopper_pearson(count: int, n: int, level: float = 0.95) -> tuple[float, flo
 def wilson(share: float, n: int, level: float = 0.95) -> tuple[float, float]:
     """Returns Wilson's (1927) score interval of a share of n trials, which without any is from 0 to 1."""
     _check_level(level)
+    if not 0 <= share <= 1:
+        raise InputError(f"share: {share} is not between 0 and 1")
     if not n:
         return 0.0, 1.0
     z = NormalDist().inv_cdf((1 + level) / 2)

@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -178,13 +178,22 @@ def check_kind(result: object) -> None:
         raise InputError(f"result: must be an xarray.Dataset, as from simulate, not of type {type(result).__name__}")
 
 
-def require(result: xr.Dataset, names: Iterable[str]) -> None:
+METRICS_ONLY = (
+    "result: holds metrics only, which are in the table STORE/runs.parquet, for pandas.read_parquet; mrctl run STORE "
+    "--run K --out DIR makes the signals of one run"
+)
+
+
+def require(result: xr.Dataset, names: Collection[str]) -> None:
     """Checks that a result has the variables that are about to be read.
 
     Raises:
-        InputError: One is missing, as may happen with a result of an older mrctl; the message names that version.
+        InputError: One is missing, as may happen with a result of an older mrctl; the message names that version. Or
+            the result holds metrics only.
     """
     check_kind(result)
+    if "time" in names and "time" not in result.variables:
+        raise InputError(METRICS_ONLY)
     for name in names:
         if name not in result.variables:
             writer = f", which mrctl {version} wrote" if (version := written_by(result)) else ""

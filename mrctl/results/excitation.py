@@ -19,7 +19,7 @@ from mrctl.control.features import FEATURE_NAMES, feature_matrix
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import require
-from mrctl.results.metrics import as_runs, control_period
+from mrctl.results.metrics import as_runs, control_period, warn_if_decimated
 
 ROUNDING = 1e-14  # eigenvalues below this share of the largest are due to rounding; long runs have a larger share
 MOTIONS = {"commanded": ("v_command", "omega_command"), "true": ("v", "omega")}
@@ -103,6 +103,7 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
     require(result, ("time", "half_track", "feature_scale", *names))
     runs = as_runs(result)
     period = control_period(runs)
+    warn_if_decimated(runs, "the eigenvalues")
     if not np.isfinite(window):
         raise InputError(f"window: {window} s is not finite")
     samples = round(window / period)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError, reading
-from mrctl.results.dataset import ADDED_SIGNALS, FAULTS, SIGNALS, require, scenarios_of
+from mrctl.results.dataset import ADDED_SIGNALS, FAULTS, METRICS_ONLY, SIGNALS, require, scenarios_of
 from mrctl.results.metrics import as_runs
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import GRAVITY
@@ -118,10 +118,7 @@ def export(
         raise InputError(f"to: {to!r} is not {', '.join(get_args(Format))}")
     out = Path(out)
     if not {"x", "time"} <= set(result.variables):
-        raise InputError(
-            "result: holds metrics only, which are in the table STORE/runs.parquet, for pandas.read_parquet; mrctl run "
-            "STORE --run K --out DIR makes the signals of one run"
-        )
+        raise InputError(METRICS_ONLY)
     whole = as_runs(result)
     numbers, counts = np.unique(whole["run"].values, return_counts=True)
     if (counts > 1).any():

@@ -162,8 +162,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         raise InputError("result: no samples")
     size = runs.sizes["run"]
     period = control_period(runs)
-    if (every := round(period / runs.attrs.get("control_period", period))) > 1:
-        warnings.warn(f"time: holds one of {every} samples, so that the metrics are approximate", stacklevel=2)
+    warn_if_decimated(runs, "the metrics")
     narrow = runs[[name for name in ("x", "failed", "failure_time") if name in runs]]
     divisions = [laps_of(narrow.isel(run=row)) for row in range(size)]
     counts = [len(laps.edges) - 1 for laps in divisions]
@@ -284,6 +283,19 @@ def excitation(command: Array, period: float, half_track: Array, scale: Array) -
     return np.where(finite, np.square(least) / n, np.nan)
 
 
+def warn_if_decimated(runs: xr.Dataset, what: str) -> None:
+    """Warns that something is approximate where a result holds only some of the samples; tells the caller's caller."""
+    period = control_period(runs)
+    if (every := round(period / runs.attrs.get("control_period", period))) > 1:
+        warnings.warn(f"time: holds one of {every} samples, so that {what} are approximate", stacklevel=3)
+
+
+def _check_factor(factor: float) -> None:
+    """Raises `InputError` if a factor on an error that a run is to come back to is below 1."""
+    if not factor >= 1:
+        raise InputError(f"factor: {factor} is below 1")
+
+
 def _rms(signal: Array) -> Array:
     """Returns the root mean square along the last axis."""
     return np.sqrt(np.mean(np.square(signal), axis=-1))
@@ -301,12 +313,13 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
     Raises:
         InputError: The result has no record of the guard.
     """
-    require(result, ("guard", "guard_reason"))
+    require(result, ("time", "guard", "guard_reason"))
     runs = as_runs(result)
+    whole = runs.sizes["time"] > 0 and runs["time"].values[0] == 0.0  # an interval may begin after an action
     rows = []
     for row, number in enumerate(runs["run"].values):
         action, reason = (np.nan_to_num(runs[name].values[row]).astype(int) for name in ("guard", "guard_reason"))
-        for k in np.flatnonzero(np.diff(action, prepend=0)):
+        for k in np.flatnonzero(np.diff(action, prepend=0 if whole else action[:1])):
             if np.isnan(runs["guard"].values[row, k]):
                 continue  # the NaN after a failure are no actions
             name = GUARD_ACTIONS[action[k]] if action[k] != NONE else "resume"
@@ -329,8 +342,7 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
         InputError: There is no such metric, or the factor is below 1.
     """
     known(metric)
-    if not factor >= 1:
-        raise InputError(f"factor: {factor} is below 1")
+    _check_factor(factor)
     number = np.full(laps.sizes["run"], np.nan)
     for row, count in enumerate(laps["laps"].values):
         value = laps[metric].values[row, :count]
@@ -349,15 +361,16 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
         metric: One of `METRICS`.
         change: Number of the lap, from 2, at whose beginning the change came.
         until: Number of the last lap before the next change.
-        factor: Largest ratio to the lap before the change that counts as recovered.
+        factor: Largest ratio to the lap before the change that counts as recovered, at least 1.
 
     Returns:
         Number of laps `(run,)`: 0 if no lap is outside, infinite if the last lap is, NaN if the run failed.
 
     Raises:
-        InputError: There is no such metric, or no such lap.
+        InputError: There is no such metric, or no such lap, or the factor is below 1.
     """
     known(metric)
+    _check_factor(factor)
     if not 2 <= change <= until <= laps.sizes["lap"]:
         raise InputError(f"change: lap {change} and lap {until} are not in order within 2 to {laps.sizes['lap']}")
     values = laps[metric].transpose("run", "lap").values[:, change - 2 : until]

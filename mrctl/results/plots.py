@@ -24,13 +24,13 @@ from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
-from mrctl.results.dataset import check_kind, held_scenarios, scenarios_of, unique_runs
+from mrctl.results.dataset import METRICS_ONLY, check_kind, held_scenarios, scenarios_of, unique_runs
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap, shown_unit
 from mrctl.theory.obstacles import Obstacles, turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -232,16 +232,15 @@ def compare_errors(
         window: Times to show in s.
         lap: Number of the lap to show instead of a window.
     """
-    curves = []
     colours = colours_of(("none", "fel"))
-    for result, label, colour in zip((result_pid, result_nn), labels, colours, strict=True):
-        for data, _, style in _curves(result, window, lap):
-            curves.append(Curve(data, label, {**style, "color": colour}))
-    figure = _errors(curves, _plant(result_pid, result_nn))
+    each = [
+        [Curve(data, label, {**style, "color": colour}) for data, _, style in _curves(result, window, lap)]
+        for result, label, colour in zip((result_pid, result_nn), labels, colours, strict=True)
+    ]
+    figure = _errors([curve for curves in each for curve in curves], _plant(result_pid, result_nn))
     for axes, name in zip(figure.axes, ERRORS, strict=True):
-        for row, label in enumerate(labels):
-            colour = colours[row]
-            text = _rms([data for data, other, _ in curves if other == label], name)
+        for row, (curves, colour) in enumerate(zip(each, colours, strict=True)):
+            text = _rms([data for data, _, _ in curves], name)
             axes.text(1 - 0.26 * (1 - row), 1.0, text, color=colour, fontsize=8, ha="right", va="bottom",
                       transform=axes.transAxes)  # fmt: skip
     return figure
@@ -395,19 +394,22 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
 
 
 @styled
-def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
+def distributions(samples: Mapping[str, ArrayLike], label: str, mark: float | None = None) -> Figure:
     """Draws the share of runs below each value, on a log axis; a failed run, whose value is not finite, is below none.
 
     Args:
         samples: A positive number for each run, by name; a controller of this name gives the colour.
         label: Quantity and unit for the axis.
+        mark: Value at which a dotted line is drawn, such as 1 for ratios.
     """
     figure, (axes,) = _figure(COLUMN_WIDTH, 0.8 * COLUMN_WIDTH)
     lines = _lines(dict(zip(samples, colours_of(samples), strict=True)))
-    for name, values in samples.items():
+    for name, given in samples.items():
+        values = np.asarray(given, float)
         finite = np.sort(values[np.isfinite(values)])
         axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **lines[name])
-    axes.axvline(1, color="0.4", lw=0.8, ls=":")
+    if mark is not None:
+        axes.axvline(mark, color="0.4", lw=0.8, ls=":")
     axes.set(xlabel=label, ylabel="share of runs", xscale="log", ylim=(0, 1.02))
     low, high = axes.get_xlim()
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5) if high < 40 * low else ()))  # more numbers would overlap
@@ -570,7 +572,7 @@ def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | N
         raise InputError("window: give a window or a lap, not both")
     runs = as_runs(result)
     if "time" not in runs.dims:
-        raise InputError("result: holds metrics only; mrctl run STORE --run K --out DIR makes the signals of one run")
+        raise InputError(METRICS_ONLY)
     labels = [str(label) for label in runs["label"].values]
     colours, curves = _colours(runs), []
     for row, label in enumerate(labels):

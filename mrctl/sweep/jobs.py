@@ -37,7 +37,7 @@ from mrctl.sweep.axes import CONTROLLER_FIELD
 from mrctl.sweep.plan import Sweep
 from mrctl.sweep.pool import Cluster, JobOutcome, Pool, Processes, Work, carry_out, check_address
 from mrctl.sweep.store import Store
-from mrctl.theory.robot import CAR
+from mrctl.theory.robot import CAR, RobotFile
 
 # rooms on which no stored run depends
 SHOWING_ROOMS = ("checks", "envs", "experiments", "viewer", "cli", "__main__.py")
@@ -118,7 +118,7 @@ def run(
 
 
 def _absolute(sweep: Sweep) -> Sweep:
-    """Returns the sweep with absolute paths of the user's files, so that they are found from every folder.
+    """Returns the sweep with absolute paths of what learners start from and of the user's controllers.
 
     Raises:
         InputError: A file is missing.
@@ -159,7 +159,7 @@ def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> 
 
 def _failed(tables: Iterable[Path]) -> int:
     """Counts the runs in tables that failed."""
-    return sum(pq.read_table(table, columns=["failed"])["failed"].to_numpy().sum() for table in tables)
+    return sum(int(pq.read_table(table, columns=["failed"])["failed"].to_numpy().sum()) for table in tables)
 
 
 def _manifest(sweep: Sweep) -> dict[str, Any]:
@@ -222,13 +222,13 @@ def code_digest(but: tuple[str, ...] = SHOWING_ROOMS) -> str:
 
 def _models(sweep: Sweep) -> dict[str, str]:
     """Returns digests of the compiled worlds with their robots, of the user's stages, and of `files`, by name."""
-    worlds = {
-        ", ".join(filter(None, (world, steering))) + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
-            mjcf.load(world, steering, robot=robot)
-        )
-        for world, steering, robot in sweep.worlds
-    }
+    worlds = {_model(*one): mjcf.digest(mjcf.load(one[0], one[1], robot=one[2])) for one in sweep.worlds}
     return worlds | {own: user_files.digest(own) for own in sweep.drivers if own} | _digests(sweep.files)
+
+
+def _model(world: str, steering: str | None, robot: RobotFile) -> str:
+    """Returns the name of a world with a robot in it among the digests."""
+    return ", ".join(filter(None, (world, steering))) + (f", {robot.path}" if robot != CAR else "")
 
 
 def _digests(files: Iterable[str]) -> dict[str, str]:
@@ -428,10 +428,10 @@ def sweep_of(store: Store) -> Sweep:
 
 
 def check_files(out: str | Path, run: int) -> None:
-    """Refuses one run of a stored sweep if its world, its robot or what its learner starts from is not there.
+    """Refuses one run of a stored sweep if its world, its robot or what its learner starts from is not as it was.
 
     Raises:
-        InputError: A file is missing, or what the learner starts from has changed; the message names the file.
+        InputError: A file is missing or has changed; the message names the file.
     """
     store = Store(out)
     if (scenario := sweep_of(store).valid(run)) is None:
@@ -439,8 +439,11 @@ def check_files(out: str | Path, run: int) -> None:
     world_path(scenario.world)
     if scenario.robot != CAR:
         robot_path(scenario.robot)
-    files = filter(None, (scenario.learned, scenario.fel.weights))
-    for file, digest in _digests(files).items():
+    files = _digests(filter(None, (scenario.learned, scenario.fel.weights)))
+    if store.writer == __version__:  # another version may compile the same files to another model
+        model = mjcf.load(scenario.world, scenario.steering, robot=scenario.robot)
+        files[_model(scenario.world, scenario.steering, scenario.robot)] = mjcf.digest(model)
+    for file, digest in files.items():
         if store.manifest["models"].get(file, digest) != digest:
             raise InputError(f"{file}: has changed since {out} was computed")
 

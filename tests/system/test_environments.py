@@ -27,6 +27,7 @@ from mrctl import (
     Perturbation,
     Pid,
     Scenario,
+    Waypoints,
     replicates,
     summary,
 )
@@ -456,6 +457,30 @@ def test_reward():
     assert reward((x, y, theta)) == 1
     assert reward((x + 0.03, y - 0.04, theta)) == pytest.approx(0.5)
     assert reward((x, y, theta + 0.05 / half_track)) == pytest.approx(0.5, rel=1e-2)
+
+
+def test_reward_of_an_arrival():
+    """A robot that stands at its goal has the reward of its place, and not that of one that has failed."""
+    way = Waypoints(points=((0, 0), (0.2, 0), (0.4, 0)), closed=False, speed=0.3)
+    (pose,) = way.sample(np.array([way.period])).pose
+    env = TrackingEnv(Scenario(reference=way, laps=1, goal=tuple(pose), initial_spread=(0, 0, 0)))
+    env.reset(seed=0)
+    over = False
+    while not over:
+        _, reward, over, truncated, info = env.step(np.zeros(2))
+        assert not truncated
+    assert info["failure"] == "" and reward > 0.5
+
+
+def test_refused_reset_of_a_vector():
+    """Where the perturbation of one robot is refused, no robot begins again; seeds may be NumPy's in a list."""
+    env = TrackingVectorEnv(3, SHORT)
+    env.reset(seed=[np.int64(3), 1, 2])
+    assert [s.seed for s in env.episodes.scenarios] == [3, 1, 2]
+    env.step(np.zeros((3, 2)))
+    with pytest.raises(InputError):
+        env.reset(options={"perturbation": [None, "bad", None]})
+    assert not env.episodes.start.any()
 
 
 def test_actions():

@@ -74,6 +74,8 @@ def test_too_fast(steering, name, delay, times):
     assert set(events["run"]) == {2}
     assert set(events["reason"]) - {""} <= {"sustained oscillation", "velocity far from the command"}
     assert laps["guard_actions"].values[2].sum() == (events["action"] != "resume").sum()
+    acts = np.flatnonzero(np.diff(runs.guard.values[2]) > 0)[0] + 2  # a fallback has begun, and lasts
+    assert len(guard_events(runs.isel(time=slice(acts, None)))) == len(events) - 1
     actions = laps["guard_actions"].values
     assert (actions[0] == 0).all()
     lost = np.isnan(bare[0])  # the laps from the one on in which the robot without a guard is lost, if it is

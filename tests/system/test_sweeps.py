@@ -286,6 +286,8 @@ def test_run_again_needs_its_files(tmp_path, capsys):
     file.unlink()
     assert f"{file}: No such file" in refused(capsys, "run", store, "--run", 1)
     file.write_bytes(kept)
+    world.write_text(world.read_text().replace("<worldbody>", '<option gravity="0 0 -9.7"/>\n  <worldbody>'))
+    assert f"{world}: has changed since {store} was computed" in refused(capsys, "run", store, "--run", 1)
     world.unlink()
     assert f"no file {world}" in refused(capsys, "run", store, "--run", 1)
 

@@ -205,3 +205,12 @@ def test_quantile_interval():
     assert few == (3, 1, np.inf, 3, 1)
     assert comparison.quantile_interval(np.arange(71.0), 0.95).high == np.inf > 71  # 0.95⁷¹ > 0.025
     assert comparison.quantile_interval(np.arange(72.0), 0.95).high == 71
+
+
+def test_refused_floors_and_shares():
+    """A tie is no negative number and no NaN, and a share lies between 0 and 1."""
+    for floor in (-1.0, np.nan):
+        with pytest.raises(InputError, match="^floor: "):
+            comparison.superiority([1.0], [2.0], floor=floor)
+    with pytest.raises(InputError, match="^share: 1.2 is not"):
+        comparison.wilson(1.2, 10)

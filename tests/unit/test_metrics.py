@@ -297,6 +297,8 @@ def test_recovery_laps():
     found = metrics.recovery_laps(table, "v_rmse", change=3, until=5)
     np.testing.assert_array_equal(found, [0, 1, 2, np.inf, np.nan])
     assert metrics.recovery_laps(table, "v_rmse", 3, 5, factor=1.3).values[3] == 1
+    with pytest.raises(InputError, match="^factor: 0.9 is below 1"):
+        metrics.recovery_laps(table, "v_rmse", 3, 5, factor=0.9)
     for change, until in ((1, 3), (4, 3), (3, 7)):
         with pytest.raises(InputError, match="^change: "):
             metrics.recovery_laps(table, "v_rmse", change, until)

@@ -178,6 +178,10 @@ def test_compare_errors():
         assert drawn(axes, result["time"], 1e3 * pid[name]) and drawn(axes, result["time"], 1e3 * nn[name][0])
         rms = [1e3 * np.sqrt(np.mean(one[name].values ** 2)) for one in (pid, nn)]
         assert [text.get_text() for text in axes.texts] == [f"RMS {value:.0f}" for value in rms]
+    same = plots.compare_errors(pid, nn, labels=("PID", "PID"))
+    assert [[t.get_text() for t in one.texts] for one in same.axes] == [
+        [t.get_text() for t in one.texts] for one in figure.axes
+    ]
     failed = plots.compare_errors(pid, fail(nn, 0, 3.0))
     assert failed.axes[0].texts[1].get_text() == "failed" and legend(failed)[1].endswith("(failed)")
 
@@ -429,7 +433,9 @@ def test_distributions():
     figure = plots.distributions({"fel": np.array([3.0, np.nan, 1.0, 2.0])}, "ratio")
     (axes,) = figure.axes
     np.testing.assert_array_equal(axes.lines[0].get_xydata(), [[1, 0.25], [2, 0.5], [3, 0.75]])
-    assert legend(figure) == ["fel"]
+    assert legend(figure) == ["fel"] and len(axes.lines) == 1
+    (marked,) = plots.distributions({"fel": [3.0, 2.0]}, "ratio", mark=1).axes
+    assert list(marked.lines[1].get_xdata()) == [1, 1]
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.13, 2.0), (0.9, 1.2), (0.01, 40.0)])

@@ -357,3 +357,8 @@ def test_replicates():
     assert np.abs(np.corrcoef(factors.T) - np.eye(len(REPLICATE_HALF_WIDTHS))).max() < 0.15
     with pytest.raises(InputError, match="^first: -1 "):
         replicates(heavy, 2, first=-1)
+    assert replicates(heavy, 1, first=2**32 - 1)[0].seed == 2**32 - 1
+    with pytest.raises(InputError, match="^first: 4294967295 to 4294967296 are not"):
+        replicates(heavy, 2, first=2**32 - 1)
+    with pytest.raises(InputError, match="^count: -3 is below 1"):
+        replicates(heavy, -3)

@@ -472,3 +472,20 @@ def test_regroup(sizes):
 def test_difference(old, new, expected):
     """The first place where two descriptions differ."""
     assert folder._difference(old, new) == expected
+
+
+def test_toml_without_none(tmp_path):
+    """A field that is not set is left out in a value of an axis too; TOML has no word for one in a list."""
+    sweep = Sweep.of([Scenario(laps=1, events=(Event(time=0.5, learning=False),)), Scenario(laps=1)])
+    path = tmp_path / "sweep.toml"
+    path.write_text(sweep.to_toml())
+    again = Sweep.from_toml(path)
+    assert [again.scenario(run) for run in range(2)] == [sweep.scenario(run) for run in range(2)]
+    with pytest.raises(InputError, match="None"):
+        Sweep.from_dict({"axes": [{"field": "steering", "values": [None, "rigid"]}]}).to_toml()
+
+
+def test_grid_of_one_value():
+    """A grid of one value cannot hold two ends."""
+    with pytest.raises(InputError, match="one value cannot be both 0.5 and 1.5"):
+        Sweep.from_dict({"axes": [{"field": "perturbation.slope", "grid": {"start": 0.5, "stop": 1.5, "count": 1}}]})
