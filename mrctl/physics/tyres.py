@@ -2,7 +2,7 @@
 
 MuJoCo's tyres are soft and creep a little, so the wheels do not turn by exactly the distance over the radius. A part of
 the difference, 0.05 % of the radius, is constant, and an estimator finds it by itself. The rest depends on the motion;
-an estimator that knows it has a quarter less error, and a consistent covariance.
+an estimator that knows it has less error, and a consistent covariance.
 """
 
 # pyright: reportAttributeAccessIssue=false

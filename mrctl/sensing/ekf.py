@@ -307,7 +307,7 @@ def absorb_fix(fix: Array, s: Row) -> None:
 
 
 @kernel
-def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Row) -> None:
+def find_radius(difference: float, now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> None:
     """Decides whether a wheel has another radius than before, as after a puncture, and writes it into the samples.
 
     While both wheels grip and the acceleration is below `CALM_ACCELERATION`, no wheel can slip much, and encoders and
@@ -315,15 +315,17 @@ def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Ro
 
         d ← d + (T/τ) (v_l − v_r + 2 D (θ̇_gyro − b) − d),    τ = `RADIUS_AVERAGE`
 
-    is within four standard deviations of counts, gyro, b and s, plus `GRIP_DIFFERENCE`. Where it is not, a wheel has
-    another radius, and the standard deviations of s_l and s_r are raised to |d|/V, at most `RADIUS_DOUBT`. The gyro
-    then tells their difference, and the fixes tell their sum.
+    is within four standard deviations of counts, gyro, b and s, plus `GRIP_DIFFERENCE`. The noise of a slow gyro is the
+    same until its next sample, in which time θ̇ changes too (`HELD_NOISE`). Where d is larger, a wheel has another
+    radius, and the standard deviations of s_l and s_r are raised to |d|/V, at most `RADIUS_DOUBT`. The gyro then tells
+    their difference, and the fixes tell their sum.
 
     Args:
         difference: v_l − v_r + 2 D (θ̇_gyro − b) in m/s.
         now: In and out: a record of `SAMPLE`, whose `doubt` is the result.
         geometry: As for the estimator `truth`.
-        period: Control period in s.
+        period: Time T since the last samples of the encoders in s.
+        sensor: A record of `SENSOR`.
         s: In and out: a record of `EKF`.
     """
     if np.hypot(now.acceleration[0] - s.offset, now.acceleration[1]) > CALM_ACCELERATION:
@@ -331,10 +333,12 @@ def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Ro
     s.difference += period / RADIUS_AVERAGE * (difference - s.difference)
     P, u, D = s.P, s.inertial, geometry.half_track
     variance = 2 * (geometry.wheel_radius / RADIUS_AVERAGE) ** 2 * s.encoder_variance
-    variance += 4 * D * D * (s.gyro_variance * period / (2 * RADIUS_AVERAGE) + P[BIAS, BIAS])
+    held = max(1.0, sensor.gyro_every / sensor.encoder_every)
+    variance += 4 * D * D * (s.gyro_variance * held * period / (2 * RADIUS_AVERAGE) + P[BIAS, BIAS])
     variance += u * u * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT] - 2 * P[SCALE_LEFT, SCALE_RIGHT])
     variance -= 4 * D * u * (P[BIAS, SCALE_LEFT] - P[BIAS, SCALE_RIGHT])
-    if abs(s.difference) > 4 * np.sqrt(variance) + GRIP_DIFFERENCE:
+    turn = 2 * D * HELD_NOISE[1] * period * (sensor.gyro_every - 1) / sensor.encoder_every
+    if abs(s.difference) > 4 * np.sqrt(variance) + GRIP_DIFFERENCE + turn:
         now.doubt = min(abs(s.difference) / max(abs(u), GRIP_DIFFERENCE), RADIUS_DOUBT)
         s.difference = 0.0
 
@@ -348,7 +352,8 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
         V ← V + T (a − o) + 2 ω₀ T e,    o ← o − ω₀² T e,    e = mean of v_l,r − (V ∓ D ω) over the wheels that grip
 
     It has the bandwidth ω₀ = `OBSERVER_BANDWIDTH`, and its offset o is faster than that of the filter. A wheel slips if
-    its own difference is larger than `SLIPPING_SPEED` plus one count, or if it is the larger one and the two together
+    its own difference is larger than `SLIPPING_SPEED` (or four standard deviations of the observer's V, if that is
+    more) plus one count, or if it is the larger one and the two together
     contradict the gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by
     three times `HELD_NOISE` then. Between two samples of slow encoders e is unknown, and what was decided last holds.
     The rate of an encoder that counts is a mean since its last sample; V and ω are then means over the same ticks.
@@ -375,11 +380,14 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     s.since[:] = 0.0
     waits, turn = period * (sensor.accelerometer_every - 1), HELD_NOISE[1] * period * (sensor.gyro_every - 1)
     bound = SLIPPING_SPEED + r * sensor.quantum / gap + 3 * (HELD_NOISE[0] * waits + D * turn)
+    # White noise moves V of the observer by N/(2 √ω₀); `SLIPPING_SPEED` covers that of the tiers.
+    bandwidth = min(OBSERVER_BANDWIDTH, 0.5 / gap)  # V is corrected by e at most
+    bound += max(0.0, 4 * sensor.accelerometer_sigma * np.sqrt(period / (4 * bandwidth)) - SLIPPING_SPEED)
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (v - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (v + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound
     if now.grip[0] + now.grip[1] == 2:
-        find_radius(left - right, now, geometry, gap, s)
+        find_radius(left - right, now, geometry, gap, sensor, s)
     spread = 4 * (r / gap) ** 2 * s.encoder_variance
     spread += 4 * D * D * (s.gyro_variance + turn * turn + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
@@ -390,7 +398,6 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     count = now.grip[0] + now.grip[1]
     if count > 0:
         mean = (now.grip[0] * left + now.grip[1] * right) / count
-        bandwidth = min(OBSERVER_BANDWIDTH, 0.5 / gap)  # V is corrected by e at most
         ahead += 2 * bandwidth * gap * mean
         s.offset -= bandwidth**2 * gap * mean
     s.inertial = ahead

@@ -131,6 +131,7 @@ def user(
         for k in range(5):  # the mean is as old as the samples, so that odometry can go on from it
             memory.mean[k] += memory.answer[k] - s.estimate[k]
             s.estimate[k] = memory.answer[k]
+        s.estimate[2] = wrapped(s.estimate[2])
         settle(s.estimate, tick, ring, i)
     else:
         settle(memory.mean, tick - s.age, ring, i)

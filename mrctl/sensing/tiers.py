@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -239,6 +240,26 @@ class Sensing(Record):
             estimator: A key of `AWAITED`; by default `source`, which a user's estimator replaces.
         """
         return self.periods("delay", control_period) + self.latency(estimator or self.source, control_period)
+
+    def hold(self, control_period: float, estimator: str | None = None) -> int:
+        """Returns how old the last samples of slow sensors are on average, in control periods, rounded up.
+
+        Controllers are designed for this in addition to `loop_delay`. A sample that comes every n periods is held for
+        (n − 1)/2 of them on average, and the rate of an encoder that counts is a mean over n periods. `ekf` knows V if
+        one of encoders and accelerometer is fast, and it extrapolates θ̇ over a slow gyro's samples by the command.
+
+        Args:
+            control_period: Control period in s.
+            estimator: As for `loop_delay`.
+        """
+        estimator = estimator or self.source
+        if estimator == "truth":
+            return 0
+        held = {name: (self.periods(f"{name}_rate", control_period) - 1) / 2 for name in AWAITED[estimator]}
+        held["encoder"] *= 2 if self["encoder_counts"] else 1
+        if estimator == "ekf":
+            return ceil(min(held["encoder"], held["accelerometer"]))
+        return ceil(max(held.values()))
 
     def check(self, control_period: float, duration: float) -> None:
         """Refuses rates and latencies that do not fit a run.

@@ -8,9 +8,10 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 from pydantic import Field, model_validator
 
-from mrctl.record import Record
+from mrctl.record import Record, bounds
 from mrctl.theory.drive import (
     NO_LIMIT,
     Backlash,
@@ -42,7 +43,7 @@ class Perturbation(Record):
     mass_factor: Factor = 1.0
     """Factor on mass and inertia of every body."""
     inertia_factor: Factor = 1.0
-    """Factor on the yaw inertia of the chassis, whose mass stays."""
+    """Factor on the yaw inertia of the body `chassis`, whose mass stays; bodies welded to it keep theirs."""
     payload: Annotated[float, Field(ge=0, le=200)] = 0.0
     """Payload on the chassis in kg, a point mass."""
     payload_x: Annotated[float, Field(ge=-1, le=1)] = 0.1
@@ -110,14 +111,16 @@ class Perturbation(Record):
         """Returns the perturbation of one robot on one day, with its unknown differences drawn at random.
 
         Each factor in `REPLICATE_HALF_WIDTHS` is multiplied by a uniform draw from 1 ± w; to the slope a uniform draw
-        from ± `REPLICATE_SLOPE` is added.
+        from ± `REPLICATE_SLOPE` is added. A result beyond the limits of its field becomes the limit.
 
         Args:
             random: Source of random numbers; each draw takes the same number of values from it.
         """
         changed = {name: getattr(self, name) * (1 + random.uniform(-w, w)) for name, w in REPLICATE_HALF_WIDTHS.items()}
         changed["slope"] = self.slope + random.uniform(-REPLICATE_SLOPE, REPLICATE_SLOPE)
-        return self.replace(**changed)
+        limits = {name: bounds(type(self).model_fields[name]) for name in changed}
+        clipped = {name: min(max(x, limits[name][Ge]), limits[name][Le]) for name, x in changed.items()}
+        return self.replace(**clipped)
 
     def of_driver(self, driver: Driver) -> Driver:
         """Returns the perturbed driver: dead zones and resistances add; the lower limit and number of steps hold."""

@@ -357,6 +357,9 @@ def test_replicates():
     assert np.abs(np.corrcoef(factors.T) - np.eye(len(REPLICATE_HALF_WIDTHS))).max() < 0.15
     with pytest.raises(InputError, match="^first: -1 "):
         replicates(heavy, 2, first=-1)
+    extreme = replicates(Scenario(perturbation=Perturbation(left_radius_factor=1.2, slope=-0.5)), 20)
+    assert all(0.8 <= r.perturbation.left_radius_factor <= 1.2 and r.perturbation.slope >= -0.5 for r in extreme)
+    assert {r.perturbation.left_radius_factor for r in extreme} > {1.2}
     assert replicates(heavy, 1, first=2**32 - 1)[0].seed == 2**32 - 1
     with pytest.raises(InputError, match="^first: 4294967295 to 4294967296 are not"):
         replicates(heavy, 2, first=2**32 - 1)

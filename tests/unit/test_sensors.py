@@ -272,6 +272,23 @@ def test_fixes():
 # -- rates, latencies, seeds -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("sensing", "periods"),
+    [
+        ({"estimator": "odometry"}, 0),
+        ({"estimator": "odometry", "encoder_rate": 10}, 9),  # a mean over 10 periods, held for 9: 4.5 + 4.5
+        ({"estimator": "odometry", "encoder_rate": 10, "encoder_counts": 0}, 5),
+        ({"estimator": "odometry", "gyro_rate": 5}, 10),
+        ({"estimator": "ekf", "encoder_rate": 10}, 0),
+        ({"estimator": "ekf", "encoder_rate": 10, "accelerometer_rate": 20}, 2),
+        ({"estimator": "truth", "encoder_rate": 10}, 0),
+    ],
+)
+def test_age_of_slow_samples(sensing, periods):
+    """How many control periods of 10 ms the samples are old on average, to the next whole one."""
+    assert Sensing(tier="lab", **sensing).hold(0.01) == periods
+
+
 def test_rates_and_latencies():
     """Every sensor has its own rate and latency: a slow run shows the signals of a quick one, later and held."""
     base = Scenario(reference=Circle(period=4, radius=0.6), laps=1, learner="none", seed=2)
