@@ -272,7 +272,7 @@ class Record(BaseModel, metaclass=_Constructors):
         The first line is a comment with the version of mrctl. A list of records has one line for each of its elements.
 
         Raises:
-            InputError: A list contains None, which TOML cannot say.
+            InputError: A value within a list or a table is None, which TOML cannot say.
         """
         return f"{WRITTEN_BY}{__version__}\n" + "".join(
             f"{name} = {_toml(value, nested=False)}\n"
@@ -283,10 +283,9 @@ class Record(BaseModel, metaclass=_Constructors):
 def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
     """Returns a value as TOML; numbers, booleans and strings are written as in JSON, and DEL is escaped."""
     if isinstance(value, dict):
-        given = {key: item for key, item in value.items() if item is not None}
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in given.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if value is None:
-        raise InputError("values: a list contains None, which TOML cannot say; write JSON, or leave the value out")
+        raise InputError("TOML cannot say None, which a value within a list or a table is")
     if isinstance(value, list) and not nested and any(isinstance(item, dict) for item in value):
         return "[\n" + "".join(f"    {_toml(item)},\n" for item in value) + "]"
     if isinstance(value, list):

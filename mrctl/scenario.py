@@ -256,7 +256,7 @@ def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]
         first: Seed of the first replicate.
 
     Raises:
-        InputError: There are no replicates, one would have no valid seed, or a drawn perturbation is beyond its limits.
+        InputError: There are no replicates, or one would have no valid seed.
     """
     if count < 1:
         raise InputError(f"count: {count} is below 1")

@@ -68,8 +68,8 @@ class Pid(Record):
     for the plant K/(τ s + 1); by default the gains are the largest that the delay allows."""
     delay: Annotated[float, Field(ge=0, le=MAX_DELAY)] | None = None
     """Delay from measurement to voltage in s that the design of the gains assumes; by default `sensing.delay` and,
-    except with the estimator `truth`, the largest latency of encoders, gyro and accelerometer; without effect with
-    `time_constant`."""
+    except with the estimator `truth`, the largest latency of encoders, gyro and accelerometer and the mean age of the
+    samples of slow ones; without effect with `time_constant`."""
     retune: bool = True
     """Whether each oscillation slows the controllers for the rest of the run, as 10 ms more delay would: in turn the
     motion controller with the learner, and the PID; without effect with `time_constant`."""

@@ -232,7 +232,7 @@ class Episodes:
         if len(perturbations) != len(seeds):
             raise InputError(f"perturbation: {len(perturbations)} of them for {len(seeds)} robots")
         coming = [self._next(row, seed, perturbations[row]) for row, seed in enumerate(seeds)]
-        for row, scenario in enumerate(coming):  # where one is refused, no robot has begun
+        for row, scenario in enumerate(coming):  # if one of them is invalid, no robot has begun
             self._begin(row, scenario)
 
     def act(self, action: Array, scale: Array | float = 1.0) -> None:
@@ -275,8 +275,9 @@ class Episodes:
 
         Returns:
             Observations, `(B, 14)`, with the parts in `OBSERVATIONS` side by side. Rewards, `(B,)`: one on the
-            reference, a half where the rear wheels are 5 cm off it, zero where a robot has failed. That distance is the
-            root mean square over the two wheels, √(e_x² + e_y² + (D e_θ)²), of the true posture.
+            reference, a half where the rear wheels are 5 cm off it, zero where a robot has failed, and after the tick
+            in which it arrived. That distance is the root mean square over the two wheels, √(e_x² + e_y² + (D e_θ)²),
+            of the true posture.
         """
         seen, wanted = self.sense()
         loop, size, robot = self.loop, len(self.scenarios), self.plant.robot

@@ -3,8 +3,7 @@
 The import of this module registers `mrctl/TwistTracking-v0`, `mrctl/VoltageTracking-v0`, `mrctl/ResidualTracking-v0`
 and `mrctl/Navigation-v0`. An action is that of `mrctl.envs.episodes.Episodes` divided by `bound`, so that it lies
 between −1 and 1. An observation holds the parts in `sizes` one after another. The seed of a reset becomes the seed of
-the scenario: where the action adds nothing, the episode has the same bits as `simulate` with that seed and
-`pid.retune` off.
+the scenario: with a residual of zero the episode has the same bits as `simulate` with that seed and `pid.retune` off.
 """
 
 from __future__ import annotations

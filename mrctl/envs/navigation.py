@@ -64,9 +64,9 @@ class Navigating(Episodes):
         self._away, self._drives = self._distance(), np.ones(len(scenarios), bool)
         self._reward = np.zeros(len(scenarios))
 
-    def begin(self, row: int, seed: int, perturbation: object = None) -> None:
-        """Begins another episode of one robot; the arguments are those of `Episodes.begin`."""
-        super().begin(row, seed, perturbation)
+    def _begin(self, row: int, scenario: Scenario) -> None:
+        """Begins an episode of one robot; see `Episodes._begin`."""
+        super()._begin(row, scenario)
         self._away[row], self._reward[row] = self._distance()[row], 0.0
 
     def sense(self) -> tuple[Rows, Rows]:

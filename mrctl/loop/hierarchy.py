@@ -261,10 +261,9 @@ class Hierarchy:
         else:
             self.learner, load = learner_of(scenarios, robot, delays[0]), load_learned
             self.learner.prior = self.prior
-        designed = [delay + s.sensing.hold(self.period, estimator) for s, delay in zip(scenarios, delays, strict=True)]
         self.settings = [
             Settings(s.pid, s.kanayama, s.prefilter, delay * self.period, load(s) if s.learned else None)
-            for s, delay in zip(scenarios, designed, strict=True)
+            for s, delay in zip(scenarios, delays, strict=True)
         ]
         self._adopt(range(size))
         self.state = state = np.zeros(size, CONTROL)

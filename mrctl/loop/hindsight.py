@@ -63,7 +63,7 @@ def drive(scenarios: Sequence[Scenario], coefficients: Array | None, threads: in
     hierarchy = simulation.hierarchy
     prior = hierarchy.prior.rows
     if coefficients is not None:
-        prior["c"] = coefficients  # the PID's integral is still zero, that of the nominal model
+        prior["c"] = coefficients  # the PID's integral is zero, because the simulation was built with the nominal prior
     gram, seen = np.zeros((len(scenarios), 8, 8)), np.zeros((len(scenarios), 8, 2))
     while simulation.running:
         simulation.step()

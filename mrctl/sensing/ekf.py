@@ -353,10 +353,10 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
 
     It has the bandwidth ω₀ = `OBSERVER_BANDWIDTH`, and its offset o is faster than that of the filter. A wheel slips if
     its own difference is larger than `SLIPPING_SPEED` (or four standard deviations of the observer's V, if that is
-    more) plus one count, or if it is the larger one and the two together
-    contradict the gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by
-    three times `HELD_NOISE` then. Between two samples of slow encoders e is unknown, and what was decided last holds.
-    The rate of an encoder that counts is a mean since its last sample; V and ω are then means over the same ticks.
+    more) plus one count, or if it is the larger one and the two together contradict the gyro. Between two samples of a
+    slow accelerometer or gyro the last one is used, which may be wrong by three times `HELD_NOISE` then. Between two
+    samples of slow encoders e is unknown, and what was decided last holds. The rate of an encoder that counts is a mean
+    since its last sample; V and ω are then means over the same ticks.
 
     Args:
         now: In and out: a record of `SAMPLE`, whose `grip` and `doubt` are the result.
@@ -380,9 +380,11 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     s.since[:] = 0.0
     waits, turn = period * (sensor.accelerometer_every - 1), HELD_NOISE[1] * period * (sensor.gyro_every - 1)
     bound = SLIPPING_SPEED + r * sensor.quantum / gap + 3 * (HELD_NOISE[0] * waits + D * turn)
-    # White noise moves V of the observer by N/(2 √ω₀); `SLIPPING_SPEED` covers that of the tiers.
+    # White noise of density N moves V of the observer by N/(2 √ω₀), also in samples that are held; `SLIPPING_SPEED`
+    # covers that of the tiers.
     bandwidth = min(OBSERVER_BANDWIDTH, 0.5 / gap)  # V is corrected by e at most
-    bound += max(0.0, 4 * sensor.accelerometer_sigma * np.sqrt(period / (4 * bandwidth)) - SLIPPING_SPEED)
+    density = sensor.accelerometer_sigma * np.sqrt(period * sensor.accelerometer_every)
+    bound += max(0.0, 4 * density / (2 * np.sqrt(bandwidth)) - SLIPPING_SPEED)
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (v - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (v + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound

@@ -233,26 +233,27 @@ class Sensing(Record):
     def loop_delay(self, control_period: float, estimator: str | None = None) -> int:
         """Returns the delay of the loop for which controllers are designed, in control periods.
 
-        It is `delay` and the age of the samples from which the estimate is made.
+        It is `delay` and the age of the samples from which the estimate is made: their latency and `hold`.
 
         Args:
             control_period: Control period in s.
             estimator: A key of `AWAITED`; by default `source`, which a user's estimator replaces.
         """
-        return self.periods("delay", control_period) + self.latency(estimator or self.source, control_period)
+        estimator = estimator or self.source
+        age = self.latency(estimator, control_period) + self.hold(estimator, control_period)
+        return self.periods("delay", control_period) + age
 
-    def hold(self, control_period: float, estimator: str | None = None) -> int:
+    def hold(self, estimator: str, control_period: float) -> int:
         """Returns how old the last samples of slow sensors are on average, in control periods, rounded up.
 
-        Controllers are designed for this in addition to `loop_delay`. A sample that comes every n periods is held for
-        (n − 1)/2 of them on average, and the rate of an encoder that counts is a mean over n periods. `ekf` knows V if
-        one of encoders and accelerometer is fast, and it extrapolates θ̇ over a slow gyro's samples by the command.
+        A sample that comes every n periods is held for (n − 1)/2 of them on average, and the rate of an encoder that
+        counts is a mean over n periods. `ekf` knows V if one of encoders and accelerometer is fast, and it extrapolates
+        θ̇ over a slow gyro's samples by the command.
 
         Args:
+            estimator: A key of `AWAITED`.
             control_period: Control period in s.
-            estimator: As for `loop_delay`.
         """
-        estimator = estimator or self.source
         if estimator == "truth":
             return 0
         held = {name: (self.periods(f"{name}_rate", control_period) - 1) / 2 for name in AWAITED[estimator]}

@@ -56,12 +56,6 @@ class Grid(Record):
     count: Annotated[int, Field(ge=1, le=10_000)]
     """Number of values."""
 
-    @model_validator(mode="after")
-    def _reaches_stop(self) -> Self:
-        if self.count == 1 and self.start != self.stop:
-            raise ValueError(f"count: one value cannot be both {self.start:g} and {self.stop:g}")
-        return self
-
 
 class Axis(Record):
     """One field of the scenario and its values: a list, a grid, or a distribution."""

@@ -431,7 +431,7 @@ def check_files(out: str | Path, run: int) -> None:
     """Refuses one run of a stored sweep if its world, its robot or what its learner starts from is not as it was.
 
     Raises:
-        InputError: A file is missing or has changed; the message names the file.
+        InputError: A file is missing or has changed; the message names it, or the world with steering and robot.
     """
     store = Store(out)
     if (scenario := sweep_of(store).valid(run)) is None:
@@ -440,7 +440,7 @@ def check_files(out: str | Path, run: int) -> None:
     if scenario.robot != CAR:
         robot_path(scenario.robot)
     files = _digests(filter(None, (scenario.learned, scenario.fel.weights)))
-    if store.writer == __version__:  # another version may compile the same files to another model
+    if store.manifest["versions"] == versions():  # others may compile the same files to another model
         model = mjcf.load(scenario.world, scenario.steering, robot=scenario.robot)
         files[_model(scenario.world, scenario.steering, scenario.robot)] = mjcf.digest(model)
     for file, digest in files.items():

@@ -40,6 +40,13 @@ QUIET_TIME = 2.0  # s for which values are checked without a progress bar
 FILE_FIELDS = "learned", "fel.weights"  # fields of the scenario with the name of a file that each run reads
 
 
+def _given(value: Any) -> Any:  # noqa: ANN401
+    """Returns a dumped value without the fields of records that are not set."""
+    if isinstance(value, dict):
+        return {k: _given(v) for k, v in value.items() if v is not None}
+    return [_given(v) for v in value] if isinstance(value, list) else value
+
+
 class Sweep(Record):
     """Many runs: a base scenario, and the axes along which it varies."""
 
@@ -79,7 +86,7 @@ class Sweep(Record):
         """Makes a sweep whose run i is `scenarios[i]`; `settings` are further fields, all but `base` and `axes`."""
         default = Scenario().model_dump(mode="json")
         every = [s.model_dump(mode="json") for s in scenarios]
-        changes = [{k: v for k, v in one.items() if k == "seed" or v != default[k]} for one in every]
+        changes = [{k: _given(v) for k, v in one.items() if k == "seed" or v != default[k]} for one in every]
         return cls.from_dict({**settings, "axes": [{"field": SCENARIO_FIELD, "values": changes}]}, "sweep")
 
     @model_validator(mode="after")
@@ -118,6 +125,9 @@ class Sweep(Record):
         sets_seed = [axis.field for axis in self.axes if "seed" in axis.fields]
         if self.runs > 1 and sets_seed and all(axis.listed for axis in self.axes):
             raise InputError(f"runs: the axis {sets_seed[0]} sets the seed, so that all {self.runs} draws are copies")
+        for axis in self.axes:
+            if (grid := axis.grid) and grid.count == 1 and grid.start != grid.stop:
+                raise InputError(f"{axis.field}: a grid of one value cannot hold both {grid.start:g} and {grid.stop:g}")
         for group in self._dimensions:
             seen = set()
             for values in zip(*(self.axes[a].listed for a in group), strict=True):

@@ -62,8 +62,9 @@ class Recording:
         self.scenario: Scenario = scenarios_of(run)[0]
         self.controller = str(run["feedforward"].values) if "feedforward" in run.coords else self.scenario.feedforward
         label = str(run["label"].values)
-        title, stages = title_of(self.controller), label.removeprefix(self.controller + "+")  # of the user
-        self.label = title if label == self.controller else label if stages == label else f"{title} + {stages}"
+        own = not self.scenario.name and label.startswith(self.controller)
+        stages = label[len(self.controller) :].strip("+ ")  # of the user; results before 0.49.0 have " + " in front
+        self.label = " + ".join(filter(None, (title_of(self.controller), stages))) if own else label
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
         log = blank(run.sizes["time"])

@@ -254,7 +254,7 @@ def recovery(robot, rigid, gains, loops, delay, limits):
 @pytest.mark.parametrize("world", ["lab", "paper"])
 @pytest.mark.parametrize("steering", ARRANGEMENTS)
 def test_guarantee(steering, world):
-    """The worst learner within D keeps the errors in the region, and one beyond it what the loops recover from.
+    """The worst learner within D keeps the errors near the region, and one beyond it what the loops recover from.
 
     The linear loops bound the posture error by ρ̄ and the position error by `recovery`; the limits on acceleration and
     the turns of the lemniscate add to them, most of all under rigid steering with the slow PID of the paper. In `lab`

@@ -61,7 +61,10 @@ def test_hard_limit(feedforward):
 
 
 def test_hard_limit_with_predictions():
-    """`composite` need not be told: its error is the same within a tenth, and the guard leaves it alone."""
+    """`composite` need not be told: the median error is the same within a tenth, and the guard leaves it alone.
+
+    Of six robots, because the error of a single one differs by up to a fifth between seeds where it is not told.
+    """
     untold, _ = limited("model+composite", 1.3, 12.0, 3, range(6), told=False)
     told, guarded = limited("model+composite", 1.3, 12.0, 3, range(6), told=True, guard=True)
     assert np.median(told) == pytest.approx(np.median(untold), rel=0.1) and told.max() < 3.5

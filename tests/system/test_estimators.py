@@ -501,6 +501,7 @@ def test_slow_inertial_sensors(slow):
         {"encoder_rate": 10, "accelerometer_rate": 10},
         {"encoder_rate": 20, "accelerometer_rate": 20},
         {"accelerometer_noise": 0.5},
+        {"accelerometer_noise": 0.5, "accelerometer_rate": 10},
     ],
     ids=lambda slow: "-".join(f"{name}-{value}" for name, value in slow.items()),
 )
@@ -515,7 +516,7 @@ def test_nominal_robots_bear_poor_sensors(slow):
     assert not runs.failed.any()
     assert float((runs.slip > 0.1).mean()) < 0.1
     error = np.sqrt(((runs.omega - runs.omega_ref) ** 2).isel(time=slice(300, None)).mean("time")).values
-    assert (error < 0.1).all()
+    assert (error < 0.2).all()
 
 
 def test_a_slow_gyro_punctures_no_wheel():

@@ -63,6 +63,7 @@ def test_arrival():
     assert rewards[:-1] == pytest.approx(0.004, abs=0.0045) and abs(seen[-1][0]) < 0.1
     side = seen[:, 5 + 30 + 15]  # the beam at a quarter turn to the left, less half a degree
     assert side[0] == 4.0 and 1.8 < side.min() < 1.85  # nothing, and later the disc that passes
+    assert np.array_equal(drive(env, slower)[1], rewards)  # nor does the next episode remember where this one ended
 
 
 @pytest.mark.parametrize(

@@ -242,31 +242,33 @@ class Drive:
         self.tick += 1
 
 
-@given(st.integers(0, 10**6), st.floats(-0.05, 0.05), st.floats(0.1, 1.0), st.booleans(), st.sampled_from([1, 5, 20]))
-@settings(max_examples=50, deadline=None)
+@given(
+    st.integers(0, 10**6), st.floats(-0.05, 0.05), st.floats(0.1, 1.0), st.booleans(),
+    st.sampled_from([(1, 1), (1, 5), (1, 20), (4, 1), (4, 20)]),
+)  # fmt: skip
+@settings(max_examples=100, deadline=None)
 def test_another_radius(seed, difference, speed, calm, every):
     """The radii are doubted when the mean difference, a decaying exponential, leaves its band, and only in calm.
 
-    The noise of a gyro that is read in every n-th period has n times the variance in the mean; θ̇ of its sample may be
-    old by n − 1 periods.
+    The noise of a gyro sample counts as often as the encoders are read before the next one; in between θ̇ changes.
     """
-    sensor = np.zeros(1, SENSOR)[0]
-    sensor["encoder_every"], sensor["gyro_every"] = 1, every
+    sensor, gap, repeats = np.zeros(1, SENSOR)[0], T * every[0], max(1, every[1] / every[0])
+    sensor["encoder_every"], sensor["gyro_every"] = every
     s, rng = random_filter(seed)
     s["inertial"] = speed
     sample = sample_of(s, rng)
     sample["acceleration"], sample["doubt"] = (s["offset"] + (0.0 if calm else 1.01 * laws.CALM_ACCELERATION), 0), 0
     counts = 2 * s["encoder_variance"] * (RADIUS / laws.RADIUS_AVERAGE) ** 2
-    turning = (2 * HALF) ** 2 * s["gyro_variance"] * every * T / (2 * laws.RADIUS_AVERAGE)
+    turning = (2 * HALF) ** 2 * s["gyro_variance"] * repeats * gap / (2 * laws.RADIUS_AVERAGE)
     slope = np.zeros(N)  # of the difference by the state
     slope[[BIAS, SCALE_LEFT, SCALE_RIGHT]] = -2 * HALF, speed, -speed
     band = 4 * np.sqrt(counts + turning + slope @ s["P"] @ slope) + laws.GRIP_DIFFERENCE
-    band += 2 * HALF * laws.HELD_NOISE[1] * T * (every - 1)
-    means = difference * (1 - (1 - T / laws.RADIUS_AVERAGE) ** np.arange(1, 501))
+    band += 2 * HALF * laws.HELD_NOISE[1] * T * (every[1] - 1)
+    means = difference * (1 - (1 - gap / laws.RADIUS_AVERAGE) ** np.arange(1, 501))
     expected = np.flatnonzero(abs(means) > band)[:1]
     found = None
     for n in range(500):
-        laws.find_radius(difference, sample, CAR, T, sensor, s)
+        laws.find_radius(difference, sample, CAR, gap, sensor, s)
         if sample["doubt"] > 0:
             found = n
             break

@@ -286,7 +286,9 @@ def test_fixes():
 )
 def test_age_of_slow_samples(sensing, periods):
     """How many control periods of 10 ms the samples are old on average, to the next whole one."""
-    assert Sensing(tier="lab", **sensing).hold(0.01) == periods
+    one = Sensing(tier="lab", **sensing)
+    assert one.hold(one.source, 0.01) == periods
+    assert one.loop_delay(0.01) == one.periods("delay", 0.01) + one.latency(one.source, 0.01) + periods
 
 
 def test_rates_and_latencies():

@@ -74,7 +74,7 @@ def test_steady_turn(robot, v, omega):
 
 @pytest.mark.parametrize(("trail", "tolerance"), [(0.0, 0.002), (0.03, 0.02)])
 def test_rate(robot, trail, tolerance):
-    """The rate set-point is the angle's derivative (the lag's own change neglected), and leads it to mid-period."""
+    """The rate set-point is the angle's derivative, and leads it to mid-period."""
     h = 1e-3
     angle, rate = fork(robot.model_copy(update={"trail": trail}), Lemniscate().sample(h * np.arange(6000)), period=h)
     slope = (angle[2:] - angle[:-2]) / (2 * h)
@@ -87,7 +87,7 @@ def test_rate(robot, trail, tolerance):
 
 @pytest.mark.parametrize("period", [0.02, 0.05, 0.1])
 def test_rate_as_a_robot_leaves_rest(robot, period):
-    """The rate of the fork on an arc from rest is that of fine steps, however long the control period is.
+    """The rate of the fork, as the curvature grows from rest on, is that of fine steps with any control period.
 
     The lag t/speed then shrinks by a large factor from one period to the next.
     """
@@ -96,7 +96,7 @@ def test_rate_as_a_robot_leaves_rest(robot, period):
         allocation, found = Allocation(robot, period=step), []
         for tick in range(round(1.0 / step)):
             v, v_dot = 1.5 * step * (tick + 1), 1.5
-            omega = 0.5 * np.sin(3 * v) * v  # the curvature grows with the way
+            omega = 0.5 * np.sin(3 * v) * v
             allocation([v, omega], [v_dot, (0.5 * np.sin(3 * v) + 1.5 * np.cos(3 * v) * v) * v_dot])
             found.append(allocation.rate)
         return np.array(found)

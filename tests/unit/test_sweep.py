@@ -475,17 +475,19 @@ def test_difference(old, new, expected):
 
 
 def test_toml_without_none(tmp_path):
-    """A field that is not set is left out in a value of an axis too; TOML has no word for one in a list."""
+    """A field of a scenario that is not set is left out; a None that means something is refused, and not dropped."""
     sweep = Sweep.of([Scenario(laps=1, events=(Event(time=0.5, learning=False),)), Scenario(laps=1)])
     path = tmp_path / "sweep.toml"
     path.write_text(sweep.to_toml())
     again = Sweep.from_toml(path)
     assert [again.scenario(run) for run in range(2)] == [sweep.scenario(run) for run in range(2)]
-    with pytest.raises(InputError, match="None"):
-        Sweep.from_dict({"axes": [{"field": "steering", "values": [None, "rigid"]}]}).to_toml()
+    for field, values in (("steering", [None, "rigid"]), ("scenario", [{"steering": None}, {}])):
+        with pytest.raises(InputError, match="TOML cannot say None"):
+            Sweep.from_dict({"base": {"steering": "rigid"}, "axes": [{"field": field, "values": values}]}).to_toml()
 
 
 def test_grid_of_one_value():
     """A grid of one value cannot hold two ends."""
-    with pytest.raises(InputError, match="one value cannot be both 0.5 and 1.5"):
-        Sweep.from_dict({"axes": [{"field": "perturbation.slope", "grid": {"start": 0.5, "stop": 1.5, "count": 1}}]})
+    sweep = {"axes": [{"field": "perturbation.slope", "grid": {"start": 0.0, "stop": 0.1, "count": 1}}]}
+    with pytest.raises(InputError, match="^perturbation.slope: a grid of one value cannot hold both 0 and 0.1"):
+        Sweep.from_dict(sweep).check_draws()
