@@ -62,9 +62,10 @@ class Recording:
         self.scenario: Scenario = scenarios_of(run)[0]
         self.controller = str(run["feedforward"].values) if "feedforward" in run.coords else self.scenario.feedforward
         label = str(run["label"].values)
-        own = not self.scenario.name and label.startswith(self.controller)
-        stages = label[len(self.controller) :].strip("+ ")  # of the user; results before 0.49.0 have " + " in front
-        self.label = " + ".join(filter(None, (title_of(self.controller), stages))) if own else label
+        # Behind the feedforward, which is left out if it is `none`, stand other stages; before 0.49.0 with " + ".
+        stages = label.removeprefix(self.controller).strip("+ ")
+        named = self.scenario.name or not (label.startswith(self.controller) or self.controller == "none")
+        self.label = label if named else " + ".join(filter(None, (title_of(self.controller), stages)))
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
         log = blank(run.sizes["time"])

@@ -121,7 +121,7 @@ def test_own_controller(avoid: Avoid, tmp_path: Path, capsys: pytest.CaptureFixt
     given, name = ["navigate", "doorway:3", "--avoid", avoid], f"model+{own}:Half"
     assert cli.main([*given, "--controller", name, "--compare", "model", "fel", "--out", str(out)]) == 0
     printed, result = capsys.readouterr().out, mrctl.open(out / "result.zarr")
-    beside = "" if avoid == "none" else " + window"
+    beside = "" if avoid == "none" else "+window"
     assert result["label"].values.tolist() == [label + beside for label in ("model+Half", "model", "fel")]
     assert f"| model+Half{beside} " in printed and "| arrived |" in printed
     robot = Scenario(prior="model", learner="none")
