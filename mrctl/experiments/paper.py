@@ -50,7 +50,7 @@ IDEAL: dict[str, Any] = {
 """The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit.
 
 Learners and observer have settings for that PID; their defaults are for a PID that is ten times as fast. The samples of
-`composite` are exact, so that they have less noise than by default.
+`composite` are exact, so that they have less noise than by default; 0.07 V was chosen on the cases of this benchmark.
 """
 REAL: dict[str, dict[str, Any]] = {
     **{name: dict(FEEDFORWARDS[name]) for name in COMPARED},
