@@ -53,6 +53,7 @@ def suite(
     quick: bool = False,
     full: bool = False,
     held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...")] = None,
+    cells: Literal["first", "second"] = "first",
     workers: int | None = None,
     out: Path | None = None,
 ) -> None:
@@ -73,9 +74,10 @@ def suite(
         full: Run all cases, in every tier, in hours.
         held_out: Instead, drive these feedforwards, or some of your own as for --controller, through 40 cells that no
             setting was chosen on, and compare each with model, true_model and model+observer.
+        cells: With --held-out: the set of cells; the second one was listed to confirm what the first one had shown.
         workers: Number of processes on this machine; by default one for each core.
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
-            suite_quick, suite_full or held_out.
+            suite_quick, suite_full, held_out or, of the second set, held_out_second.
     """
     check_workers(workers)
     if seeds is not None and seeds < 1:
@@ -87,7 +89,10 @@ def suite(
     if held_out is not None:
         if feedforward or controller or random is not None:
             raise InputError("held_out: names the feedforwards to judge; give no others, and no random scenarios")
-        return _judge_held_out(held_out, seeds, workers, out or Path("held_out"))
+        folder = out or Path("held_out" if cells == "first" else f"held_out_{cells}")
+        return _judge_held_out(cells, held_out, seeds, workers, folder)
+    if cells != "first":
+        raise InputError("cells: is for --held-out")
     from mrctl.experiments import suite as uncertainty
     from mrctl.experiments.cases import RANDOM, REPLICATES, Mode, entries
 
@@ -101,12 +106,14 @@ def suite(
     expect_all(aside)
 
 
-def _judge_held_out(names: Sequence[str], seeds: int | None, workers: int | None, folder: Path) -> None:
+def _judge_held_out(
+    cells: Literal["first", "second"], names: Sequence[str], seeds: int | None, workers: int | None, folder: Path
+) -> None:
     """Drives feedforwards through cells that no setting was chosen on: `mrctl suite --held-out NAME ...`."""
     from mrctl.experiments import held_out
     from mrctl.experiments.cases import REPLICATES
 
-    aside = held_out.judge(names, REPLICATES["core"] if seeds is None else seeds, workers, folder)
+    aside = held_out.judge(cells, names, REPLICATES["core"] if seeds is None else seeds, workers, folder)
     print((folder / "table.md").read_text("utf-8"))
     expect_all(aside)
 

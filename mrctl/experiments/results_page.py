@@ -48,7 +48,10 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "reproduce": ("reproduce --out reproduction",),
     "suite": ("suite --out suite",),
     "random": ("suite --full --feedforward none fel true_model model+composite --seeds 4 --random 1000 --out worlds",),
-    "held_out": ("suite --held-out model+composite model+mrac model+rls model+fel model+l1 model+indi --out held_out",),
+    "held_out": (
+        "suite --held-out model+composite model+mrac model+rls model+fel model+l1 model+indi --out held_out",
+        "suite --held-out model+composite model+mrac model+rls model+fel --cells second --out held_out_second",
+    ),
     "tune": (
         *(f"tune {robot} --delay 0 0.01 0.02 --out tune/{robot}" for robot in ROBOTS),
         "tune --time-constant 0.15 --delay 0 0.02 0.04 --out tune/imc",
@@ -77,7 +80,7 @@ def main(
     reproduce: Path | None = None,
     suite: Path | None = None,
     random: Path | None = None,
-    held_out: Path | None = None,
+    held_out: tuple[Path, ...] = (),
     tune: tuple[Path, ...] = (),
     search: tuple[Path, ...] = (),
     navigate: tuple[Path, ...] = (),
@@ -95,7 +98,7 @@ def main(
         reproduce: Folder that `mrctl reproduce --out` wrote.
         suite: Folder that `mrctl suite --out` wrote.
         random: Folder that `mrctl suite --full --random 1000 --out` wrote, for its random worlds alone.
-        held_out: Folder that `mrctl suite --held-out` wrote.
+        held_out: Folders that `mrctl suite --held-out` wrote, one for each set of cells.
         tune: Folders that `mrctl tune --out` wrote: one for each robot, for its designed PID, and one with
             `--time-constant`, for where learning is safe.
         search: Folders that `mrctl tune --search` wrote, one for each entry.
@@ -117,7 +120,7 @@ def main(
     if everything is not None:
         found = drive(everything)
         (reproduce,), (suite,), (random,) = found["reproduce"], found["suite"], found["random"]
-        (held_out,), (bench,) = found["held_out"], found["bench"]
+        (bench,), held_out = found["bench"], found["held_out"]
         tune, search, identify = found["tune"], found["search"], found["identify"]
         navigate = found["navigate"]
         reactive = mppi = limits = navigate[: len(ROBOTS)]
@@ -125,7 +128,7 @@ def main(
         "The paper": reproduce and _paper_section(reproduce),
         "The uncertainty suite": suite and _suite_section(suite),
         "Random worlds": random and _random_section(random),
-        "The held-out cells": held_out and _held_out_section(held_out),
+        "The held-out cells": held_out and "\n\n".join(map(_held_out_section, held_out)),
         **_tune_sections(tune),
         "The search of settings": search and _search_section(search),
         "How narrow and how fast": navigate and _navigated(navigate, "table", "needed"),
@@ -378,7 +381,8 @@ def _random_section(folder: Path) -> str:
 def _held_out_section(folder: Path) -> str:
     table = _read(folder / "table.json", "cells", "mode")
     text = held_out_text(_text(folder / "table.md"), _text(folder / LOG_FILE))
-    return _section(shlex.join(["mrctl", "suite", "--held-out", *table["cells"]]), table, text)
+    second = [] if (cells := table.get("set", "first")) == "first" else ["--cells", cells]
+    return _section(shlex.join(["mrctl", "suite", "--held-out", *table["cells"], *second]), table, text)
 
 
 def _tune_sections(folders: Sequence[Path]) -> dict[str, str]:

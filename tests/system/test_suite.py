@@ -22,8 +22,9 @@ from scipy import stats
 
 import mrctl
 from mrctl import cli
-from mrctl.experiments import held_out, report, suite, suite_tables, tuning
+from mrctl.experiments import held_out, held_out_cells, report, suite, suite_tables, tuning
 from mrctl.experiments.cases import Case, Choice
+from mrctl.experiments.held_out_cells import Cells
 from mrctl.loop.hindsight import best_fixed
 from mrctl.results import metrics, plots
 from mrctl.results.comparison import TIE
@@ -569,10 +570,13 @@ def test_columns_say_what_they_are(whole: Path) -> None:
 
 def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A cell counts where the mean is no more than the rival's and the floor; each time it is driven is kept."""
-    monkeypatch.setattr(held_out, "courses", lambda: {"circle": COURSE})
     plants = {"heavy": mrctl.Perturbation(mass_factor=2.0), "light": mrctl.Perturbation(mass_factor=0.6)}
-    monkeypatch.setattr(held_out, "PLANTS", plants)
-    monkeypatch.setattr(held_out, "LAPS", 2)
+    sets = {
+        "first": Cells({"circle": COURSE}, plants, range(100)),
+        "second": Cells({"circle": COURSE}, plants, range(1)),
+    }
+    monkeypatch.setattr(held_out, "cells", sets.__getitem__)
+    monkeypatch.setattr(held_out_cells, "LAPS", 2)
     words = ["suite", "--held-out", "none", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)]
     for _ in range(2):
         assert cli.main(words) == 0
@@ -589,7 +593,7 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     errors = {}
     for name in ("none", "model"):
         for half in (1, 2):
-            for cell in held_out.cells(2):
+            for cell in sets["first"].cases(2):
                 changes = {**mrctl.FEEDFORWARDS[name], "physics_step": 0.002 / half}
                 runs = mrctl.simulate([s.model_copy(update=changes) for s in cell.scenarios])
                 errors[name, half, cell.name.split("; ")[1]] = mrctl.per_lap(runs).position_rmse.values[:, 0].mean()
@@ -606,10 +610,12 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert [json.loads(line)["entry"] for line in log.read_text().splitlines()] == ["none", "none", "rls", "rls"]
     assert "Held-out cells, rls" in (tmp_path / "table.md").read_text()
     (tmp_path / "mine.py").write_text(GAIN)
-    monkeypatch.setattr(held_out, "PLANTS", {"light": plants["light"]})
+    sets["first"] = sets["first"]._replace(plants={"light": plants["light"]})
     own = [*words[:1], "--held-out", f"model+{tmp_path}/mine.py:Gain", *words[3:-1], str(tmp_path / "own")]
     assert cli.main(own) == 0
     assert "at or below model" in capsys.readouterr().out and (tmp_path / "own" / "runs" / "model+Gain").is_dir()
+    assert "seeds: 2 is not between 1 and 1" in refused(capsys, [*words, "--cells", "second"])
+    assert "cells: is for --held-out" in refused(capsys, ["suite", "--cells", "second"])
     assert "is neither one of none, model+indi" in refused(capsys, ["suite", "--held-out", "model"])
     assert "name at least one" in refused(capsys, ["suite", "--held-out", "--seeds", "2"])
     assert "one of --quick" in refused(capsys, ["suite", "--held-out", "fel", "--quick"])
