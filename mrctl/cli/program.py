@@ -95,7 +95,7 @@ def _once() -> Callable[..., None]:
 
 
 def _parse(arguments: list[str]) -> Callable[[], Any]:
-    """Turns the command line into a call of one of the commands below.
+    """Turns the command line into a call of one of the commands.
 
     Raises:
         InputError: An argument is invalid.

@@ -35,16 +35,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import (
-    CHANNELS,
-    FEATURES,
-    REGRESSORS,
-    STICTION_SPEED,
-    dead_reckoned,
-    feature_scale,
-    regressor,
-    symmetric_product,
-)
+from mrctl.control.algebra import dot, symmetric_product
+from mrctl.control.features import CHANNELS, FEATURES, REGRESSORS, dead_reckoned, feature_scale, moves, regressor
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown, explained
 from mrctl.control.matching import SETTLING_TIMES, histories, low_pass, recall, sent
 from mrctl.kernel import Array, Row, kernel
@@ -110,9 +102,7 @@ def track(k: int, feedback: float, s: Row) -> None:
         return
     a, P, phi, Pphi = s.a[k], s.P[k], s.past, s.Pphi
     symmetric_product(P, phi[:REGRESSORS], Pphi)
-    power = 0.0
-    for i in range(REGRESSORS):
-        power += phi[i] * Pphi[i]
+    power = dot(phi[:REGRESSORS], Pphi[:REGRESSORS])
     if power > UNEXCITED:
         for i in range(REGRESSORS):
             a[i] += s.step[k] / power * feedback * Pphi[i]
@@ -136,7 +126,7 @@ def reset_covariance(k: int, s: Row) -> None:
 @kernel
 def detect_change(period: float, s: Row) -> None:
     """Resets the covariance where the plant has changed, and again when the filters have forgotten the former plant."""
-    settled, before = SETTLING_TIMES * period * (1 / s.filter - 1), s.since
+    settled, before = SETTLING_TIMES * period * (1 / s.share - 1), s.since
     s.since += period
     if s.power[0, 0] > CHANGE_RATIO * s.power[0, 1] or s.power[1, 0] > CHANGE_RATIO * s.power[1, 1]:
         for k in range(CHANNELS):
@@ -145,15 +135,6 @@ def detect_change(period: float, s: Row) -> None:
     if s.since == 0.0 or before < settled <= s.since:
         for k in range(CHANNELS):
             reset_covariance(k, s)
-
-
-@kernel
-def learned_voltage(a: Array, phi: Array) -> float:
-    """Returns φᵀ a, without the disturbance."""
-    total = 0.0
-    for i in range(REGRESSORS):
-        total += a[i] * phi[i]
-    return total
 
 
 @kernel
@@ -178,19 +159,19 @@ def filter_motion(shown: Shown, robot: Row, s: Row) -> None:
     twist, now, once, twice = shown.twist, s.now, s.once, s.twice
     now.twist[0], now.twist[1] = twist[0], twist[1]
     s.heading = dead_reckoned(s.heading, twist[1], shown.period, now.direction)
-    filter_twice(now.voltage, once.voltage, twice.voltage, s.filter, s.age == 0)
-    filter_twice(now.twist, once.twist, twice.twist, s.filter, s.age == 0)
-    filter_twice(now.direction, once.direction, twice.direction, s.filter, s.age == 0)
+    filter_twice(now.voltage, once.voltage, twice.voltage, s.share, s.age == 0)
+    filter_twice(now.twist, once.twist, twice.twist, s.share, s.age == 0)
+    filter_twice(now.direction, once.direction, twice.direction, s.share, s.age == 0)
     for k in range(CHANNELS):
         if s.age == 0:
             s.last[0, k] = s.last[1, k] = twist[k]
         difference = twist[k] - 2 * s.last[0, k] + s.last[1, k]
         s.variance[k] += s.lasting * (difference * difference / 6 - s.variance[k])
         s.last[1, k], s.last[0, k] = s.last[0, k], twist[k]
-        s.rate[k] = (once.twist[k] - twice.twist[k]) * s.filter / (1 - s.filter) / shown.period
+        s.rate[k] = (once.twist[k] - twice.twist[k]) * s.share / (1 - s.share) / shown.period
         s.motion[k] = twice.twist[k] - s.rate[k] * shown.period / 2
         now.voltage[k] = sent(k, shown, robot.rigid)
-    s.age += s.filter
+    s.age += s.share
 
 
 @kernel
@@ -201,7 +182,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
     s.phi_c[REGRESSORS] = 1.0
     for k in range(CHANNELS):
-        voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, REGRESSORS]
+        voltage[k] = dot(s.a[k, :REGRESSORS], s.phi_c[:REGRESSORS]) + s.a[k, REGRESSORS]
 
 
 @kernel
@@ -215,20 +196,19 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
     answered = recall(s.phi_c, queue[i], s)
     filter_motion(shown, robot, s)
     added[0] = added[1] = 0.0
-    moves = abs(s.motion[0]) + robot.half_track * abs(s.motion[1]) > STICTION_SPEED
-    if moves and s.age > SETTLING_TIMES and shown.frozen == 0:
+    if moves(s.motion, robot.half_track) and s.age > SETTLING_TIMES and shown.frozen == 0:
         regressor(s.motion, s.rate, s.twice.direction, robot.half_track, scale, s.phi)
         s.phi[REGRESSORS] = 1.0
         explained(s.motion, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
             s.residual[k] = s.twice.voltage[k] - s.residual[k]
-            added[k] = learned_voltage(s.a[k], s.phi_c)
+            added[k] = dot(s.a[k, :REGRESSORS], s.phi_c[:REGRESSORS])
             predict(k, s)
             if answered:
                 track(k, shown.feedback[k], s)
         detect_change(shown.period, s)
         for k in range(CHANNELS):
-            added[k] = learned_voltage(s.a[k], s.phi_c) - added[k]
+            added[k] = dot(s.a[k, :REGRESSORS], s.phi_c[:REGRESSORS]) - added[k]
     else:
         for k in range(CHANNELS):
             s.a[k, REGRESSORS] *= s.f[k, REGRESSORS]
@@ -283,7 +263,7 @@ COMPOSITE = np.dtype(
         ("scatter", "f8", CHANNELS),  # further noise of a sample for each m/s or rad/s of noise in the twist, V
         ("brief", "f8"),  # weight of a new sample in the brief mean square of the innovations
         ("lasting", "f8"),  # weight of a new sample in the lasting mean square, and in the variance of the twist
-        ("filter", "f8"),  # weight of a new sample in the two filters
+        ("share", "f8"),  # weight of a new sample in the two filters
         # Motion
         ("age", "f8"),  # time since the start over T + h, with the time constant T of a filter and the period h
         ("heading", "f8"),  # by dead reckoning, rad
@@ -363,7 +343,7 @@ class CompositeAdaptation(Learner):
             row["noise"] = s.noise * unit
             row["scatter"] = SCATTER_GAIN * unit * (1.0, robot.half_track)
             row["brief"], row["lasting"] = period / (period + BRIEF_AVERAGE), period / (period + LASTING_AVERAGE)
-            row["filter"] = period / (period + s.filter)
+            row["share"] = period / (period + s.filter)
         self.arrays = rows, feature_scale(robot), histories(len(settings), loop.delay, REGRESSORS + 1)
         self.restore(np.arange(len(settings)))
 
@@ -388,4 +368,4 @@ class CompositeAdaptation(Learner):
             s = self.rows[i]
             s["a"], s["norm"], s["P"], s["tick"] = 0.0, 0.0, s["stationary"], 0
             s["power"] = (s["noise"] ** 2 + s["scatter"] ** 2 * s["variance"])[:, None]
-            s["since"] = SETTLING_TIMES * self.period * (1 / s["filter"] - 1)
+            s["since"] = SETTLING_TIMES * self.period * (1 / s["share"] - 1)

@@ -14,6 +14,7 @@ FEATURE_NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
 FEATURES, REGRESSORS, CHANNELS = 8, 10, 2
 SIGN_SPEED = 0.05  # m/s, width of the smooth sign function of the friction
 STICTION_SPEED = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
+V_DOT, OMEGA_DOT = 2, 3  # the features that are accelerations; their coefficients are the inertia M
 
 
 @kernel
@@ -57,6 +58,12 @@ def regressor(command: Array, derivative: Array, direction: Array, half_track: f
 
 
 @kernel
+def moves(twist: Array, half_track: float) -> bool:
+    """Tells whether the faster wheel is faster than `STICTION_SPEED`: V in m/s and ω in rad/s, `(2,)`, and D in m."""
+    return abs(twist[0]) + half_track * abs(twist[1]) > STICTION_SPEED
+
+
+@kernel
 def dead_reckoned(heading: float, rate: float, period: float, direction: Array) -> float:
     """Turns a heading on by `period` in s at `rate` in rad/s, and writes its cosine and sine to `direction`, `(2,)`.
 
@@ -87,16 +94,6 @@ def feature_matrix(command: Array, derivative: Array, half_track: ArrayLike, sca
     return x.reshape(*shape, 8)
 
 
-@kernel
-def linear(x: Array, coefficients: Array, voltage: Array) -> None:
-    """Writes coefficientsᵀ x to the two channels: `(n,)` and `(n, 2)` in, `(2,)` out; sums run in a fixed order."""
-    for k in range(2):
-        total = 0.0
-        for i in range(x.shape[0]):
-            total += x[i] * coefficients[i, k]
-        voltage[k] = total
-
-
 def feature_scale(robot: Robot) -> Array:
     """Scales of the 8 features, `(8,)`, chosen so that each feature varies by about one on an ordinary lap.
 
@@ -106,20 +103,3 @@ def feature_scale(robot: Robot) -> Array:
     v, omega = robot.max_speed, robot.max_rotation
     products = np.array([robot.max_acceleration, robot.max_rotation_acceleration, v * omega, omega**2]) / 3
     return np.array([v, omega, *products, 3.0, 3.0])
-
-
-@kernel
-def symmetric_product(P: Array, x: Array, out: Array) -> None:
-    """P x of a symmetric P, which is read by rows, in sums that compile to vector instructions.
-
-    Args:
-        P: Symmetric matrix, `(n, n)`.
-        x: Vector, `(n,)`.
-        out: Out: P x, `(n,)`.
-    """
-    n = x.shape[0]
-    for i in range(n):
-        out[i] = 0.0
-    for j in range(n):
-        for i in range(n):
-            out[i] += P[j, i] * x[j]

@@ -18,7 +18,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.control.features import features, linear
+from mrctl.control.algebra import linear
+from mrctl.control.features import features
 from mrctl.control.nominal import nominal
 from mrctl.control.weights import arrays_by_name
 from mrctl.kernel import Array, Kernel, Row, Rows, flat, kernel

@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import FEATURES
+from mrctl.control.features import FEATURES, OMEGA_DOT, V_DOT
 from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, Shown, explained, prior_voltage
 from mrctl.control.matching import MATCHED, low_pass, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
@@ -68,7 +68,7 @@ def measure(shown: Shown, rigid: bool, queue: Rows, s: Row) -> None:
         if rigid and k == 1:
             made, rest = m.twist[1], 0.0  # the rotation that came, and no other force
         else:
-            made, rest = c[2, k] * m.rate[0] + c[3, k] * m.rate[1], s.rest[k]
+            made, rest = c[V_DOT, k] * m.rate[0] + c[OMEGA_DOT, k] * m.rate[1], s.rest[k]
         if s.started:
             low_pass(m.acted[k] - made, k, s.share, s.once, s.twice)
         else:

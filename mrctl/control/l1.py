@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from mrctl.control.features import V_DOT
 from mrctl.control.feedforward import Learner, Loop, Shown, explained
 from mrctl.control.matching import MATCHED, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
@@ -40,21 +41,11 @@ from mrctl.theory.linear import steering
 
 
 @kernel
-def adapt(error: float, inertia: float, decay: float, phi: float) -> float:
-    """Returns σ̂ = −M Φ⁻¹ e^(−a h) (x̂ − x).
-
-    Args:
-        error: x̂ − x in m/s or rad/s.
-        inertia: M in V/(m/s²) or V/(rad/s²).
-        decay: e^(−a h).
-        phi: Φ in s.
-    """
-    return -inertia * decay / phi * error
-
-
-@kernel
 def step(shown: Shown, rigid: bool, prior: Row, queue: Rows, s: Row) -> None:
     """One period of the predictor, the adaptation and the low-pass.
+
+        x̂ ← e^(−a h) x̂ + (1 − e^(−a h)) x_n−1 + (1 − Φ/h) (x_n − x_n−1) + Φ M⁻¹ (U − f̂ + σ̂)
+        σ̂ ← −M Φ⁻¹ e^(−a h) (x̂ − x_n),    C σ̂ ← C σ̂ + share (σ̂ − C σ̂)
 
     Args:
         shown: What this tick shows of the robot.
@@ -70,11 +61,11 @@ def step(shown: Shown, rigid: bool, prior: Row, queue: Rows, s: Row) -> None:
         if not known:
             s.predicted[k] = m.twist[k]
             continue
-        inertia = s.lag if rigid and k == 1 else prior.c[2 + k, k]
+        inertia = s.lag if rigid and k == 1 else prior.c[V_DOT + k, k]
         pushed = s.phi * (m.acted[k] - s.rest[k] + s.sigma[k]) / inertia
         drawn = (1 - s.decay) * m.last[k] + (1 - s.phi / shown.period) * (m.twist[k] - m.last[k])
         s.predicted[k] = s.decay * s.predicted[k] + drawn + pushed
-        s.sigma[k] = adapt(s.predicted[k] - m.twist[k], inertia, s.decay, s.phi)
+        s.sigma[k] = -inertia * s.decay / s.phi * (s.predicted[k] - m.twist[k])
         s.filtered[k] += s.share * (s.sigma[k] - s.filtered[k])
 
 

@@ -66,17 +66,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.cholesky import factor, forward, solve
-from mrctl.control.features import (
-    FEATURES,
-    REGRESSORS,
-    STICTION_SPEED,
-    dead_reckoned,
-    feature_scale,
-    linear,
-    regressor,
-    symmetric_product,
-)
+from mrctl.control.algebra import dot, factor, forward, linear, solve, symmetric_product
+from mrctl.control.features import FEATURES, REGRESSORS, V_DOT, dead_reckoned, feature_scale, moves, regressor
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import MATCHED, SETTLING_TIMES, low_pass, match, queues
 from mrctl.kernel import Array, Row, Rows, kernel
@@ -186,15 +177,6 @@ def project(M: Array, b: Array, radius: float, shifted: Array, q: Array) -> None
 
 
 @kernel
-def dot(x: Array, y: Array) -> float:
-    """The product xᵀ y."""
-    total = 0.0
-    for i in range(x.shape[0]):
-        total += x[i] * y[i]
-    return total
-
-
-@kernel
 def filter_motion(shown: Shown, queue: Rows, scale: Array, robot: Row, s: Row) -> bool:
     """Passes the mean features of the period that ends now, and the voltage that acted in it, through the two filters.
 
@@ -217,8 +199,8 @@ def filter_motion(shown: Shown, queue: Rows, scale: Array, robot: Row, s: Row) -
     if not known:
         return False
     for j in range(SIGNALS):
-        if j == 2 or j == 3:
-            signal = s.matched.rate[j - 2] / scale[j]
+        if V_DOT <= j < V_DOT + 2:
+            signal = s.matched.rate[j - V_DOT] / scale[j]
         elif j < REGRESSORS:
             signal = (s.x[j] + s.before[j]) / 2
         else:
@@ -247,10 +229,8 @@ def learn(i: int, shown: Shown, robot: Row, prior: Row, arrays: tuple[Any, ...],
     rows, scale, queue = arrays
     s = rows[i]
     settled = filter_motion(shown, queue[i], scale, robot, s)
-    now = s.matched.twist
-    moves = abs(now[0]) + robot.half_track * abs(now[1]) > STICTION_SPEED
     added[0] = added[1] = 0.0
-    if settled and moves and shown.frozen == 0:
+    if settled and moves(s.matched.twist, robot.half_track) and shown.frozen == 0:
         for k in range(2):
             s.error[k] = shown.command[k] - shown.twist[k]
             s.residual[k] = s.twice[REGRESSORS + k]

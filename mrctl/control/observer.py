@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from mrctl.control.features import OMEGA_DOT, V_DOT
 from mrctl.control.feedforward import Learner, Loop, Shown, explained
 from mrctl.control.matching import sent
 from mrctl.kernel import Array, Row, kernel
@@ -60,7 +61,7 @@ def observe(shown: Shown, rigid: bool, prior: Row, s: Row) -> None:
             s.twist[k] = twist[k]
         s.sent[k] = sent(k, shown, rigid)
     for k in range(2):
-        s.disturbance[k] = s.voltage[k] - prior.c[2, k] * s.rate[0] - prior.c[3, k] * s.rate[1]
+        s.disturbance[k] = s.voltage[k] - prior.c[V_DOT, k] * s.rate[0] - prior.c[OMEGA_DOT, k] * s.rate[1]
     s.started = True
 
 

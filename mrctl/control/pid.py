@@ -38,6 +38,7 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
         error = command[k] - twist[k]
         slope = (error - s.error[k]) / period if s.started else 0.0
         s.slope[k] += period / (s.filter[k] + period) * (slope - s.slope[k])
+        # an excess leaves the integral with the time constant K_p/K_i, at least a period
         unwind = s.k_i[k] / max(s.k_p[k], s.k_i[k] * period) * excess[k] if s.k_i[k] > 0 else 0.0
         s.integral[k] += period * (s.k_i[k] * error + unwind)
         s.error[k] = error

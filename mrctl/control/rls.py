@@ -12,15 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import (
-    FEATURES,
-    REGRESSORS,
-    dead_reckoned,
-    feature_scale,
-    linear,
-    regressor,
-    symmetric_product,
-)
+from mrctl.control.algebra import dot, linear, symmetric_product
+from mrctl.control.features import FEATURES, REGRESSORS, dead_reckoned, feature_scale, regressor
 from mrctl.control.feedforward import STEERING_SHARE, Learner, Loop, Shown
 from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
@@ -45,9 +38,7 @@ def update(x: Array, feedback: Array, s: Row) -> None:
     if abs(feedback[0]) <= s.dead_zone and abs(feedback[1]) <= s.dead_zone:
         return
     symmetric_product(s.P, x, s.gain)
-    power = 0.0
-    for i in range(REGRESSORS):
-        power += x[i] * s.gain[i]
+    power = dot(x, s.gain)
     total = max(1.0 + power, power / s.step)
     for i in range(REGRESSORS):
         for j in range(REGRESSORS):

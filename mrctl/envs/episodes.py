@@ -124,7 +124,7 @@ class Episodes:
 
         Args:
             scenarios: One for each robot; they must fit one batch.
-            action: Meaning of an action, as above.
+            action: Meaning of an action, as the class says.
             draw: Draws the perturbation of every episode, in place of the scenario's, from a generator that the
                 episode's seed determines; with `scenario.perturbation.drawn` the episode of seed k is replicate k of
                 `replicates`, if no event changes the perturbation.

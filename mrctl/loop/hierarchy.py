@@ -200,7 +200,7 @@ class Settings:
 
 
 class Hierarchy:
-    """Both controllers for the B robots of a uniform group (`simulation.group_of`).
+    """Both controllers for the B robots of a uniform group (`groups.group_of`).
 
     Attributes:
         stages: The user's stages by name, which `UserHierarchy` calls in place of the built-in ones, and the user's

@@ -56,7 +56,7 @@ class Simulation:
         """Compiles the world, and sets the robots on their references with the twist of the reference.
 
         Args:
-            scenarios: Scenarios of one group, see `group_of`.
+            scenarios: Scenarios of one group, see `groups.group_of`.
             threads: Largest number of threads of the batch engine; 0 for all cores. Control runs on one.
             restarting: Whether robots begin again on their own, with `restart`. Then no run ends at its own time, and
                 the log keeps the last tick only.

@@ -490,6 +490,7 @@ Reference = Annotated[
 ]
 
 
+@lru_cache(KEPT)
 def check(reference: Reference, robot: Robot, reverse: bool) -> None:
     """Refuses a reference that the robot cannot follow; one that passed is not sampled again.
 
@@ -502,11 +503,6 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
         InputError: The reference reverses or exceeds a limit; the message has the quantity, its peak, the time of the
             peak and the limit.
     """
-    _check(reference, robot, reverse)
-
-
-@lru_cache(KEPT)
-def _check(reference: Reference, robot: Robot, reverse: bool) -> None:
     if fault := _fault(reference, robot, reverse):
         raise InputError(f"reference {reference.kind}: {fault}{_remedy(reference, robot, reverse)}")
 

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.control.features import FEATURE_NAMES, SIGN_SPEED, feature_matrix, feature_scale, linear
+from mrctl.control.algebra import linear
+from mrctl.control.features import FEATURE_NAMES, SIGN_SPEED, feature_matrix, feature_scale
 from mrctl.control.feedforward import Loop, NoLearner, Prior
 from mrctl.kernel import over_rows
 from mrctl.theory import dynamics

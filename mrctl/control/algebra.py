@@ -1,6 +1,6 @@
-"""Cholesky factors of small symmetric positive definite matrices, M = L Lᵀ, and equations that they solve.
+"""Products of small matrices and vectors, and Cholesky factors M = L Lᵀ with the equations that they solve.
 
-LAPACK takes several times as long for eight unknowns, most of it for the call.
+Sums run in a fixed order. LAPACK takes several times as long for eight unknowns, most of it for the call.
 """
 
 from __future__ import annotations
@@ -8,6 +8,42 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array, kernel
+
+
+@kernel
+def dot(x: Array, y: Array) -> float:
+    """The product xᵀ y of two vectors, `(n,)`."""
+    total = 0.0
+    for i in range(x.shape[0]):
+        total += x[i] * y[i]
+    return total
+
+
+@kernel
+def linear(x: Array, coefficients: Array, voltage: Array) -> None:
+    """Writes coefficientsᵀ x to the two channels: `(n,)` and `(n, 2)` in, `(2,)` out."""
+    for k in range(2):
+        total = 0.0
+        for i in range(x.shape[0]):
+            total += x[i] * coefficients[i, k]
+        voltage[k] = total
+
+
+@kernel
+def symmetric_product(P: Array, x: Array, out: Array) -> None:
+    """P x of a symmetric P, which is read by rows, in sums that compile to vector instructions.
+
+    Args:
+        P: Symmetric matrix, `(n, n)`.
+        x: Vector, `(n,)`.
+        out: Out: P x, `(n,)`.
+    """
+    n = x.shape[0]
+    for i in range(n):
+        out[i] = 0.0
+    for j in range(n):
+        for i in range(n):
+            out[i] += P[j, i] * x[j]
 
 
 @kernel
