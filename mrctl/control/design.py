@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains, sampled_loop
 from mrctl.kernel import Array
+from mrctl.record import InputError
 from mrctl.theory import linear
 from mrctl.theory.linear import Linear
 from mrctl.theory.robot import Robot
@@ -95,6 +96,9 @@ def fastest_pi(plants: list[Linear], period: float, delay: float, lag: float) ->
         period: Control period in s.
         delay: Loop delay in s, without that of the hold.
         lag: Time constant of the measurement in s.
+
+    Raises:
+        InputError: No gain is too large for a loop.
     """
     from scipy.optimize import minimize_scalar  # imported here, so that settings are read without scipy
 
@@ -108,10 +112,16 @@ def fastest_pi(plants: list[Linear], period: float, delay: float, lag: float) ->
         return min(_largest_gain(control * loop) for loop in loops)
 
     longest = 10 * max(period, *(plant.lag for plant in plants))
-    found: Any = minimize_scalar(  # 1/K_i has one minimum
-        lambda x: x - np.log(k_p(x)), bounds=(np.log(period / 10), np.log(longest)), method="bounded"
-    )
+    with np.errstate(invalid="ignore"):  # where k_p is infinite
+        found: Any = minimize_scalar(  # 1/K_i has one minimum
+            lambda x: x - np.log(k_p(x)), bounds=(np.log(period / 10), np.log(longest)), method="bounded"
+        )
     gain = k_p(found.x)
+    if not np.isfinite(gain):
+        raise InputError(
+            "pid: no gain of a loop is the largest one; a steering servo without damping, as MJCF has it by default, "
+            "is such a loop: give it kv or dampratio"
+        )
     return Gains(gain, gain / float(np.exp(found.x)))
 
 

@@ -74,8 +74,8 @@ class Constant(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Relative error of the estimate."""
-        return self.estimate / self.true - 1
+        """Relative error of the estimate; NaN where the true value is 0."""
+        return self.estimate / self.true - 1 if self.true else np.nan
 
     @property
     def identifiable(self) -> bool:
@@ -129,7 +129,8 @@ def text(constants: Sequence[Constant]) -> str:
     for c in constants:
         estimate, low, high, true = (f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true))
         identifiable = "yes" if c.identifiable else "no"
-        cells.append([c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %", identifiable])
+        error = f"{100 * c.error:+.2f} %" if c.true else "–"
+        cells.append([c.name, c.unit, estimate, f"{low} to {high}", true, error, identifiable])
     parts = [markdown(header, cells), NOT_IDENTIFIABLE]
     if vague := [c.name for c in constants if not c.identifiable]:
         parts.insert(1, f"These sensors cannot tell within {100 * MAX_HALF_INTERVAL:g} %: {', '.join(vague)}.")

@@ -20,7 +20,7 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.physics.bounds import compiling
-from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, PREFIX, REAR, RIGID, UNPAIRED, bottom, has, part
+from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, PREFIX, REAR, RIGID, UNPAIRED, bottom, has, part, vertices
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
 from mrctl.theory.kinematics import UP
@@ -29,6 +29,7 @@ from mrctl.theory.robot import RobotFile
 # share of the wheel radius: a caster this near to the floor touches it, and two this close are one
 FLOOR_TOLERANCE = 0.1
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
+ROUND = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_CAPSULE)  # shapes with an axis, their z axis
 DCMOTOR = '<dcmotor joint="{}" gear="N" motorconst="k k" resistance="R" armature="J" ctrlrange="-U U"/>'
 
 
@@ -95,6 +96,16 @@ class _Adoption:
         self.rear = [self._wheel(name) for name in self.wheels]
         self.motors = [self._motor(name) for name in self.wheels]
         self.front = [self._steered_wheel(name) for name in self.steered] or self._casters()
+        for name, wheel in zip(self.steered, self.front, strict=False):
+            if wheel.joint in self.wheels:
+                raise InputError(
+                    f"wheels: that of joint {wheel.joint!r} is steered by {name!r}; mrctl drives fixed ones"
+                )
+            if self._lineage(name)[0] == wheel.body:
+                raise InputError(
+                    f"steering: the joints {_listed([name, wheel.joint])} are on one body; give the wheel a body of "
+                    "its own inside the one that is steered"
+                )
 
     # -- identification of the parts -----------------------------------------------------------------------------------
 
@@ -141,6 +152,18 @@ class _Adoption:
         chassis = name or roots.pop()
         if any(chassis not in self._lineage(joint) for joint in wheels):
             raise InputError(f"chassis: the body {chassis!r} does not carry both wheels, {_listed(wheels)}")
+        lines = [self._lineage(joint)[1:] for joint in wheels]
+        carrier = next((body for body in lines[0] if body in lines[1]), chassis)
+        for body in self._ancestry(self.model.body(carrier).id):
+            if body == chassis:
+                break
+            for j in range(self.model.njnt):
+                kind, upright = self.model.jnt_type[j], abs(self.data.xaxis[j][2]) > 0.5
+                if self.model.jnt_bodyid[j] == self.model.body(body).id and upright == (kind == HINGE):
+                    raise InputError(
+                        f"chassis: the joint {self.model.joint(j).name!r} moves the wheels in the plane beneath "
+                        f"{chassis!r}; name the body that carries them, such as {carrier!r}"
+                    )
         if chassis in (self._lineage(joint)[0] for joint in wheels):
             raise InputError(f"chassis: the body {chassis!r} is itself moved by one of {_listed(wheels)}")
         return chassis
@@ -172,7 +195,13 @@ class _Adoption:
         geoms = [g for g in range(self.model.ngeom) if self.model.geom_bodyid[g] == self.model.body(body).id]
         if not geoms:
             raise InputError(f"wheels: body {body!r} of joint {joint!r} has no geom to roll on")
-        return self._contact(min(self._colliding(geoms) or geoms, key=self._bottom), body, joint)
+        lowest = min(self._colliding(geoms) or geoms, key=self._bottom)
+        if self.model.geom_type[lowest] in ROUND and abs(self.data.geom_xmat[lowest][8]) > 0.9:
+            raise InputError(
+                f"wheels: {part(self.model, lowest)}, the wheel of joint {joint!r}, lies flat, with its axis upright; "
+                "turn it, for example by euler"
+            )
+        return self._contact(lowest, body, joint)
 
     def _on_axle(self, joint: str) -> Array:
         """Returns the place on a wheel's axle that is nearest to its centre, in the file's world in m, `(3,)`."""
@@ -232,7 +261,14 @@ class _Adoption:
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
 
     def _refuse_wheel_that_nothing_turns(self, caster: Wheel) -> None:
-        """Refuses a rolling wheel on an upright joint that has neither a servo nor, as a caster has, a trail."""
+        """Refuses a wheel on a fixed axle, or on an upright joint that has neither a servo nor a trail."""
+        line = self._ancestry(self.model.body(caster.body).id)
+        swivels = [name for name in self._hinges() if abs(self._axis(name)[2]) > 0.9 and self._lineage(name)[0] in line]
+        if caster.joint in self._hinges() and not any(self.chassis in self._lineage(name)[1:] for name in swivels):
+            raise InputError(
+                f"caster: the wheel of joint {caster.joint!r} rolls on a fixed axle, and would slide aside in a turn; "
+                "give it an upright joint with a trail, a ball joint in place of its own, or no joint"
+            )
         for name in self._hinges() if caster.joint in self._hinges() else ():
             carried = self._lineage(name)[0] in self._ancestry(self.model.body(caster.body).id)
             trail = np.hypot(*(caster.centre - self.data.joint(name).xanchor)[:2])
@@ -277,8 +313,18 @@ class _Adoption:
         return self.model.joint(joints[0]).name if ball or (kind == HINGE and level) else ""
 
     def _contact(self, geom: int, body: str, joint: str) -> Wheel:
-        """Describes a wheel by one of its geoms; the radius is the height of its centre above its lowest point."""
+        """Describes a wheel by one of its geoms; the radius is the height of its centre above its lowest point.
+
+        MuJoCo puts the centre of a mesh into its centroid. A mesh on a hinge is centred on the axle instead, and its
+        radius is the largest distance of a vertex from it.
+        """
         centre = self.data.geom_xpos[geom].copy()
+        if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and joint in self._hinges():
+            anchor, axis = self.data.joint(joint).xanchor, self._axis(joint)
+            away = centre + vertices(self.model, geom) @ self.data.geom_xmat[geom].reshape(3, 3).T - anchor
+            centre = anchor + axis * ((centre - anchor) @ axis)
+            radius = float(np.linalg.norm(away - np.outer(away @ axis, axis), axis=1).max())
+            return Wheel(body, joint, centre, radius, float(self.model.geom_friction[geom, 0]))
         return Wheel(body, joint, centre, centre[2] - self._bottom(geom), float(self.model.geom_friction[geom, 0]))
 
     def _motor(self, joint: str) -> str:
@@ -398,14 +444,21 @@ class _Adoption:
                 raise InputError(
                     f"equality: joins the body {min(joined)!r}, which mrctl moves; give it site1 and site2 instead"
                 )
+            if e.type == mujoco.mjtEq.mjEQ_JOINT and {e.name1, e.name2} == {*self.wheels}:
+                raise InputError(
+                    f"equality: couples {_listed(self.wheels)}; mrctl drives the wheels apart from each other, with "
+                    "different speeds in a turn, so take it out"
+                )
         steering = [a for a in spec.actuators if a.target in self.steered]
         coupled = [e for e in spec.equalities if {e.name1, e.name2} & {*self.steered, *self.wheels}]
         for element in [*spec.sensors, *spec.keys, *spec.pairs, *spec.excludes, *steering, *coupled]:
             spec.delete(element)
-        if spec.compiler.inertiafromgeom != 2 or spec.compiler.settotalmass > 0:  # the world's compiler has neither
+        compiler = spec.compiler  # whose settings the world's compiler does not have; geoms change their groups below
+        every_group = [*compiler.inertiagrouprange] == [0, mujoco.mjNGROUP - 1]
+        if compiler.inertiafromgeom != 2 or compiler.settotalmass > 0 or not every_group:
             for body in spec.bodies[1:]:
                 self._state_inertia(body)
-        spec.compiler.inertiafromgeom = 2  # auto: keeps the explicit inertials, such as that of the moved chassis
+        compiler.inertiafromgeom = 2  # auto: keeps the explicit inertials, such as that of the moved chassis
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
             geom.group = geom.group or 1  # rays that look for the ground see only group 0
@@ -506,6 +559,11 @@ class _Adoption:
         kp, kv = (sum(-self.model.actuator_biasprm[k, i] * gears[k] ** 2 for k in servos) for i in (1, 2))
         if not kp > 0:
             raise InputError(f"steering: {_listed(self.steered)} needs a <position> or <pid> actuator with a kp")
+        filters = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+        if any(self.model.actuator_dyntype[k] in filters for k in servos):
+            raise InputError(
+                f"steering: the servo of {_listed(self.steered)} has a timeconst, which mrctl leaves out; leave it out"
+            )
         joints = [self.model.joint(name) for name in self.steered]
         limit = float(min(np.min((j.qpos0 - j.range[0], j.range[1] - j.qpos0)) for j in joints))
         if not 0 < limit < np.pi / 2:

@@ -86,6 +86,12 @@ def part(model: mujoco.MjModel, geom: int) -> str:
     return model.geom(geom).name.removeprefix(PREFIX) or f"the {kind} of {body}"
 
 
+def vertices(model: mujoco.MjModel, geom: int) -> Array:
+    """Returns the vertices of a mesh in the frame of its geom in m, `(n, 3)`."""
+    mesh = model.mesh(model.geom_dataid[geom])
+    return model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+
+
 def bottom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     """Returns the height of the lowest point of a geom in m; infinite for one that cannot be a wheel or a caster.
 
@@ -105,9 +111,7 @@ def bottom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     if kind == shape.mjGEOM_ELLIPSOID:
         return height - np.linalg.norm(up * size)
     if kind == shape.mjGEOM_MESH:
-        mesh = model.mesh(model.geom_dataid[geom])
-        points = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
-        return height + (points @ up).min()
+        return height + (vertices(model, geom) @ up).min()
     if kind == shape.mjGEOM_BOX:
         return height - np.abs(up) @ size
     return np.inf

@@ -349,6 +349,9 @@ def _check_motor(model: mujoco.MjModel, name: str) -> None:
         raise InputError(f"actuator {name} has another input than the voltage, which mrctl commands; leave it out")
     if model.actuator_actnum[motor.id] > (motor.dynprm[0] > 0):  # more states than the current in an inductance
         raise InputError(f"actuator {name} has thermal or lugre, which equation (3) leaves out; leave them out")
+    for what, value in (("cogging", motor.biasprm[0]), ("delay", model.actuator_delay[motor.id])):
+        if value:
+            raise InputError(f"actuator {name} has {what}, which equation (3) leaves out; leave it out")
     low, high = model.actuator_ctrlrange[model.actuator_ctrladr[motor.id]]
     if low != -high:
         raise InputError(f"actuator {name} has the ctrlrange {low:g} to {high:g} V; it must be -U to U, U the supply")

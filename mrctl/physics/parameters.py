@@ -25,6 +25,8 @@ from mrctl.physics.units import mistake, too_long
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, Robot
 
+MAX_TRAIL_NOISE = 1e-6  # m; a smaller trail is that of vertices of a mesh, which are single precision
+
 
 def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.MjData | None = None) -> Robot:
     """Reads the parameters of equations (1) to (3) out of a compiled model, by element name; it takes a millisecond.
@@ -144,7 +146,13 @@ def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, f
     if has(model, "joint", "steering"):
         chassis = data.body("chassis")
         axis = rounded(chassis.xmat.reshape(3, 3).T @ (data.joint("steering").xanchor - chassis.xpos))[0]
-    return (left - right) / 2, float(axis), float(rounded(axis - front))
+    trail = 0.0 if abs(axis - front) < MAX_TRAIL_NOISE else float(rounded(axis - front))
+    if trail < 0:
+        raise InputError(
+            f"steering: the wheel stands {-1e3 * trail:.4g} mm ahead of its steering axis, which gives it no trail; "
+            "move it onto the axis or behind it"
+        )
+    return (left - right) / 2, float(axis), trail
 
 
 def _steering(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, float]:

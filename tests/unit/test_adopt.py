@@ -137,7 +137,10 @@ WEIGHED = DIFF.replace("<freejoint/>", "<freejoint/>" + STATED).replace('loss="0
 MAST = '<body pos="0 0 0.2"><geom type="box" size="0.02 0.02 0.1"/></body>'
 
 
-@pytest.mark.parametrize("setting", ['inertiafromgeom="true"', 'inertiafromgeom="false"', 'settotalmass="30"', ""])
+@pytest.mark.parametrize(
+    "setting",
+    ['inertiafromgeom="true"', 'inertiafromgeom="false"', 'settotalmass="30"', 'inertiagrouprange="0 0"', ""],
+)
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
 def test_mass_by_mujoco(file, setting):
     """Mass, centre of mass and yaw inertia are those that MuJoCo gives the file, whatever its compiler counts."""
@@ -552,11 +555,61 @@ ERRORS = {
         document(TRICYCLE.replace('<body pos="0.5', '<body name="f" pos="0.5'), MOTORS + SERVO.format("s1")).replace(
             "</mujoco>", '<equality><connect body1="f" body2="base" anchor="0 0 0"/></equality></mujoco>'), {},
         ("equality", "'base'", "site1")),
+    "cogging": (
+        document(DIFF, MOTORS.replace("ctrlrange", 'cogging="0.01 12 0" ctrlrange')), {}, ("motor_left has cogging",)),
+    "late motor": (
+        document(DIFF, MOTORS.replace("ctrlrange", 'delay="0.01" nsample="8" ctrlrange')), {},
+        ("motor_left has delay",)),
+    "coupled wheels": (
+        document(DIFF, MOTORS).replace(
+            "</mujoco>", '<equality><joint joint1="a" joint2="b"/></equality></mujoco>'), {},
+        ("equality", "'a', 'b'", "apart")),
+    "wheels that lie": (document(DIFF.replace('euler="90 0 0"', ""), MOTORS), {}, ("wheels", "joint 'a'", "lies flat")),
+    "third wheel on a fixed axle": (
+        document(DIFF.replace(BALL.format(0.3), wheel("f", "0.3 0 0")), MOTORS), {}, ("caster", "'f'", "fixed axle")),
+    "driven and steered": (
+        document(CAR, MOTORS.replace('"a"', '"c"').replace('"b"', '"d"') + SERVO.format("s1") + SERVO.format("s2")), {},
+        ("wheels", "'c' is steered by 's1'")),
+    "fork and wheel in one": (
+        document(TRICYCLE.replace('<joint name="c"', "").replace(
+            'range="-30 30"/>', 'range="-30 30"/><joint name="c" axis="0 1 0"/>'), MOTORS + SERVO.format("s1")), {},
+        ("steering", "'s1', 'c'", "one body")),
+    "servo with a filter": (
+        document(TRICYCLE, MOTORS + SERVO.format("s1").replace("kp", 'timeconst="0.1" kp')), {},
+        ("steering", "timeconst")),
+    "planar base": (
+        document('<joint name="px" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/><body name="own">'
+                 + DIFF.replace("<freejoint/>", '<joint name="pz" axis="0 0 1"/>') + "</body>", MOTORS), {},
+        ("chassis", "'pz'", "'own'")),
+    "wheel ahead of its axis": (
+        document(TRICYCLE.replace(wheel("c", "0 0 0", loss=0.02), wheel("c", "0.01 0 0", loss=0.02)),
+                 MOTORS + SERVO.format("s1")), {}, ("steering", "10 mm ahead")),
     "tips over": (document(DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"'), MOTORS), {}, ("com_offset",)),
     "not MJCF": ("<urdf/>", {}, ("mine.xml",)),
     "limits": (
         document(DIFF, MOTORS, extra='<custom><numeric name="limits" data="1 2"/></custom>'), {}, ("limits", "4")),
 }  # fmt: skip
+
+
+def test_wheel_that_is_a_mesh(file):
+    """The contact sphere lies on the axle with the mesh's radius, also where the centroid of the mesh does not."""
+    corners = [(0.1 * np.cos(a), y, 0.1 * np.sin(a)) for a in np.arange(48) * np.pi / 24 for y in (-0.02, 0.02)]
+    vertices = " ".join(f"{x:.9f}" for corner in [*corners, (0.06, 0.1, 0.03)] for x in corner)
+    mesh = f'<asset><mesh name="tyre" vertex="{vertices}"/></asset>'
+    geom = '<geom type="cylinder" size="0.1 0.02" euler="90 0 0" mass="2" friction="0.8"/>'
+    body = DIFF.replace(geom, '<geom type="mesh" mesh="tyre" mass="2"/>')
+    robot, model = read(file(document(body, MOTORS, extra=mesh)))
+    assert robot.wheel_radius == pytest.approx(0.1, rel=1e-6) and robot.half_track == pytest.approx(0.2, abs=0.03)
+    for name in ("wheel_left", "wheel_right"):
+        place = model.geom(name).pos
+        assert np.hypot(place[0], place[2]) < 1e-9 and model.geom(name).size[0] == pytest.approx(0.1, rel=1e-6)
+
+
+def test_servo_without_damping(file):
+    """A servo that nothing damps, for which no gain is too large, is refused with what to do."""
+    own = mrctl.load_robot(file(document(TRICYCLE, MOTORS + SERVO.format("s1").replace('kv="0.4"', ""))))
+    with pytest.raises(InputError, match="give it kv or dampratio"):
+        mrctl.simulate(mrctl.Scenario(robot=own, laps=1, reference=mrctl.Line(), sensing={"tier": "ideal"}))
 
 
 @pytest.mark.parametrize("name", ERRORS)

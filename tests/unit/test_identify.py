@@ -190,3 +190,9 @@ def test_json_says_what_was_identified(monkeypatch):
     kinds = {"robot": RobotFile, "perturbation": Perturbation, "sensing": Sensing}
     back = {name: kind.model_validate(found[name]) for name, kind in kinds.items()}
     assert asked == [(found["world"], *back.values(), found["seed"])] == [given]
+
+
+def test_error_of_a_constant_that_is_zero() -> None:
+    """A robot without a loss has no relative error of it, and the table shows that there is none."""
+    found = identify.Constant("I_0", "A", estimate=0.01, low=-0.02, high=0.04, true=0.0)
+    assert np.isnan(found.error)
