@@ -48,7 +48,9 @@ ELSEWHERE = {
     r"mrctl sweep .* --scheduler .*": ("tests/system/test_sweep_dask.py::test_killed_worker", "mrctl.sweep.jobs.run"),
     r"mrctl reproduce": ("tests/system/test_reproduce.py::test_network_beats_pid", "mrctl.experiments.paper.reproduce"),
     r"mrctl suite( --\w+( \d+)?)*": ("tests/system/test_suite.py::test_table", "mrctl.experiments.suite.suite"),
-    r"mrctl suite --held-out \S*": ("tests/system/test_suite.py::test_held_out", "mrctl.experiments.held_out.judge"),
+    r"mrctl suite --held-out \S*( --cells second)?": (
+        "tests/system/test_suite.py::test_held_out", "mrctl.experiments.held_out.judge",
+    ),
     r"mrctl suite --controller \S*( model\+\S*)?": (
         "tests/system/test_suite.py::test_controller_joins", "mrctl.experiments.suite.suite",
     ),
