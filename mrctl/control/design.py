@@ -98,7 +98,8 @@ def fastest_pi(plants: list[Linear], period: float, delay: float, lag: float) ->
         lag: Time constant of the measurement in s.
 
     Raises:
-        InputError: No gain is too large for a loop.
+        InputError: Every gain keeps the bounds with a loop, as with a steering servo without damping, so that there is
+            no largest one.
     """
     from scipy.optimize import minimize_scalar  # imported here, so that settings are read without scipy
 
@@ -119,8 +120,8 @@ def fastest_pi(plants: list[Linear], period: float, delay: float, lag: float) ->
     gain = k_p(found.x)
     if not np.isfinite(gain):
         raise InputError(
-            "pid: no gain of a loop is the largest one; a steering servo without damping, as MJCF has it by default, "
-            "is such a loop: give it kv or dampratio"
+            "pid: no PI gains can be designed, because no gain is too large for the model of a loop; a steering servo "
+            "without damping, MJCF's default, causes this: give it kv or dampratio"
         )
     return Gains(gain, gain / float(np.exp(found.x)))
 

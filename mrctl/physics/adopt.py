@@ -98,9 +98,7 @@ class _Adoption:
         self.front = [self._steered_wheel(name) for name in self.steered] or self._casters()
         for name, wheel in zip(self.steered, self.front, strict=False):
             if wheel.joint in self.wheels:
-                raise InputError(
-                    f"wheels: that of joint {wheel.joint!r} is steered by {name!r}; mrctl drives fixed ones"
-                )
+                raise InputError(f"wheels: the driven wheel {wheel.joint!r} is steered by {name!r}; it must not be")
             if self._lineage(name)[0] == wheel.body:
                 raise InputError(
                     f"steering: the joints {_listed([name, wheel.joint])} are on one body; give the wheel a body of "

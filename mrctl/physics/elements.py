@@ -89,7 +89,7 @@ def part(model: mujoco.MjModel, geom: int) -> str:
 def vertices(model: mujoco.MjModel, geom: int) -> Array:
     """Returns the vertices of a mesh in the frame of its geom in m, `(n, 3)`."""
     mesh = model.mesh(model.geom_dataid[geom])
-    return model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+    return model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
 
 
 def bottom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.physics.elements import REAR, bodies_of, fronts, has
+from mrctl.physics.elements import REAR, bodies_of, fronts, has, vertices
 from mrctl.physics.stand import steer
 from mrctl.record import InputError
 
@@ -68,8 +68,7 @@ def _extremes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:
     frame, centre = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     ahead = (SUPPORT_DIRECTIONS @ frame).round(12)  # the directions in the frame of the geom
     if kind == shape.mjGEOM_MESH:
-        mesh = model.mesh(model.geom_dataid[geom])
-        own = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
+        own = vertices(model, geom)
     elif kind == shape.mjGEOM_BOX:
         own = size * BOX_CORNERS
     elif kind == shape.mjGEOM_ELLIPSOID:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Array
 from mrctl.physics.bounds import check_bounds, compiling
-from mrctl.physics.elements import COLLISION, bottom
+from mrctl.physics.elements import COLLISION, bottom, vertices
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
 from mrctl.theory.obstacles import GROUND_HEIGHT, OVERHEAD_HEIGHT, Box, Disc, Obstacles, Polygon
@@ -194,8 +194,7 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
     frame, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     mesh = model.mesh(model.geom_dataid[geom]) if kind == shape.mjGEOM_MESH else None
     if mesh is not None:
-        corners = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
-        points = corners @ frame.T + place
+        points = vertices(model, geom) @ frame.T + place
     else:
         half = abs(place[2] - bottom(model, data, geom))  # infinite for a shape that is refused below
         points = place + half * np.array([[0, 0, -1.0], [0, 0, 1]])

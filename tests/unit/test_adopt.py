@@ -569,7 +569,7 @@ ERRORS = {
         document(DIFF.replace(BALL.format(0.3), wheel("f", "0.3 0 0")), MOTORS), {}, ("caster", "'f'", "fixed axle")),
     "driven and steered": (
         document(CAR, MOTORS.replace('"a"', '"c"').replace('"b"', '"d"') + SERVO.format("s1") + SERVO.format("s2")), {},
-        ("wheels", "'c' is steered by 's1'")),
+        ("driven wheel 'c' is steered by 's1'",)),
     "fork and wheel in one": (
         document(TRICYCLE.replace('<joint name="c"', "").replace(
             'range="-30 30"/>', 'range="-30 30"/><joint name="c" axis="0 1 0"/>'), MOTORS + SERVO.format("s1")), {},
