@@ -15,5 +15,5 @@ if os.environ.get("MUJOCO_GL") in ("egl", "osmesa"):
     with contextlib.suppress(ImportError):
         importlib.import_module("triton")
 
-__version__ = "0.50.0"
+__version__ = "0.51.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

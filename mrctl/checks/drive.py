@@ -39,8 +39,8 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
 
     At half of that force the robot stands, but MuJoCo's friction is soft and creeps in proportion to its load: the
     tolerance is a tenth of the speed without friction. At twice the force, or less if the tyres would slip, it rolls,
-    and back-EMF brakes it to (m g sin α − losses)/B with B = 2 N² k²/(R_a r²). The tolerance is 0.25 % of the force, of
-    which slip and sinking tyres take 0.05 % each.
+    and back-EMF and viscous friction b brake it to (m g sin α − losses)/B with B = 2 (N² k²/R_a + b)/r². The tolerance
+    is 0.25 % of the force, of which slip and sinking tyres take 0.05 % each.
     """
     force, weight = holding_force(robot), robot.mass * GRAVITY
     steepest = _steepest(robot)
@@ -69,9 +69,9 @@ def _steepest(robot: Robot) -> float:
 
 
 def top_speed(model: mujoco.MjModel, robot: Robot) -> Report:
-    """Driving straight on, V settles at r/(k_E N) · (U − U_loss), the losses being Coulomb friction.
+    """Driving straight on, V settles at (r/e) (U − U_loss), with e = N k_E + b R_a/(N k_M) and Coulomb losses.
 
-    Two voltages separate the no-load speed r U/(k_E N) from U_loss. The tolerance of the speed is 0.2 %, as the tyres
+    Two voltages separate the no-load speed r U/e from U_loss. The tolerance of the speed is 0.2 %, as the tyres
     sink in by 0.05 % of the radius; that of the loss is 1 %, as it is a small difference of large numbers.
     """
     high, low = robot.supply, robot.supply / 2
@@ -121,7 +121,7 @@ def stall(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
-    """V answers a step of U_Σ with the gain r/(k_E N) and the time constant M_e r² R_a/(2 N² k²).
+    """V answers a step of U_Σ with the gain r/(N k_E + b R_a/(N k_M)) and the time constant M_e r²/(2 (N² k²/R_a + b)).
 
     The robot already moves, so the Coulomb losses are constant and drop out. The lag of the step response is that time
     constant whatever inductance the windings have. The tolerance of 0.5 % is well under the 1.9 % that the rotors
@@ -142,18 +142,18 @@ def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
 def rotation_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     """A small step of U_Δ while driving straight on gives J_e θ̈ = 2 (D/r) (N k_M/R_a) U_Δ − (B + m c V) θ̇.
 
-    B = 2 (D/r)² N² k²/R_a is the braking of both motors. Both wheels turn forwards, so the Coulomb losses are
-    constant and drop out, and to first order V does not change. The front tyre carries no force, so that equation (3)
-    holds as it stands. The lag of the response is (J_e + m c V L_a/R_a)/(B + m c V). The tolerance of 1 % is under the
-    1.6 % that the rotors contribute to J_e: the sideways give of the tyres takes up to 0.5 %, at half the contact times
-    of the other checks.
+    B = 2 (D/r)² (N² k²/R_a + b) is the braking of both motors and of viscous friction. Both wheels turn forwards, so
+    the Coulomb losses are constant and drop out, and to first order V does not change. The front tyre carries no force,
+    so that equation (3) holds as it stands. The lag of the response is (J_e + m c V L_a/R_a)/(B + m c V). The tolerance
+    of 1 % is under the 1.6 % that the rotors contribute to J_e: the sideways give of the tyres takes up to 0.5 %, at
+    half the contact times of the other checks.
     """
     skid = on_skid_robot(robot)
     common, step = robot.supply / 3, robot.supply / 240
     arm = robot.half_track / robot.wheel_radius
     v = robot.velocity_gain * (common - loss_voltage(skid))
     offset = robot.mass * robot.com_offset * v
-    damping = 2 * arm**2 * robot.motor_gain * robot.back_emf + offset
+    damping = 2 * arm**2 * robot.motor_gain * robot.voltage_per_rate + offset
     tau = (skid.effective_inertia + offset * robot.inductance / robot.resistance) / damping
     car, _ = cruise(on_skid(crisp(model, robot, tau / 2)), robot, common)
     log = car.drive(settling_time(robot), (common - step, common + step, 0, 0), min(HOLD_TIME, tau / 10))
@@ -165,7 +165,7 @@ def rotation_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def coast_down(model: mujoco.MjModel, robot: Robot) -> Report:
-    """With the motors disconnected V falls at the constant rate (2 τ_loss/r + F_roll)/M_e.
+    """Without motors and viscous friction V falls at the constant rate (2 τ_loss/r + F_roll)/M_e.
 
     The tolerance is 0.3 %, of which sinking tyres take 0.05 %; the residual of the fit shows that the rate is constant.
     """
@@ -207,7 +207,7 @@ def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
         start = Car(crispy, twist=(robot.velocity_gain * (volts.mean() - loss), 0))
         log = start.drive(2 * settling_time(true), (*volts, 0, 0))
         v, omega, sideways = log["v"][-1], log["omega"][-1], log["v_lateral"][-1]
-        torques = true.motor_gain * (volts - true.back_emf * wheel_rates((v, omega), true))
+        torques = true.motor_gain * (volts - true.voltage_per_rate * wheel_rates((v, omega), true))
         friction = 2 * on_skid_robot(true).drive_loss
         push = (friction - torques.sum()) / true.wheel_radius - true.mass * sideways * omega
         drag = true.half_track / true.wheel_radius * (torques[1] - torques[0])

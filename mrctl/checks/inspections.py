@@ -331,22 +331,21 @@ def _grip_of_limits(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _drag(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
-    joints = [j for j in ("chassis", *rolling_wheels(model)) if model.joint(j).damping.any()]
-    motors = [motor for motor in MOTORS if model.actuator_damping[model.actuator(motor).id]]
+    joints = [j for j in ("chassis", *rolling_fronts(model)) if model.joint(j).damping.any()]
     air = [field for field in ("density", "viscosity") if getattr(model.opt, field)]
-    if not (joints or motors or air):
+    if not (joints or air):
         return None
 
     def repair(faulty: mujoco.MjModel) -> None:
         for joint in joints:
             faulty.joint(joint).damping[:] = 0
-        faulty.actuator_damping[[faulty.actuator(motor).id for motor in motors]] = 0
         faulty.opt.density = faulty.opt.viscosity = 0
 
     clauses = [f"joint {j} has damping {model.joint(j).damping.max():g}" for j in joints]
-    clauses += [f"{m} has damping {model.actuator_damping[model.actuator(m).id]:g}" for m in motors]
     clauses += [f"the air has {field} {getattr(model.opt, field):g}" for field in air]
-    advice = "in equation (3) only back-EMF brakes with speed, so write losses as frictionloss"
+    advice = (
+        "in equation (3) only the driven wheels have viscous friction, so write this as their damping or frictionloss"
+    )
     return Suspect("drag", f"{', '.join(clauses)}; {advice}", repair)
 
 
@@ -369,10 +368,24 @@ def _held_wheels(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _losses(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
-    losses = {wheel: model.joint(wheel).frictionloss[0] for wheel in REAR}
-    odd = {w: f"{w} has a frictionloss of {loss:g} N·m" for w, loss in losses.items() if _differ(*losses.values())}
-    mean, advice = sum(losses.values()) / 2, "equation (3) has one loss for both, so make them equal"
-    return _suspect("left and right losses differ", odd, advice, lambda m, wheel: [(m.joint(wheel).frictionloss, mean)])
+    def sides(m: mujoco.MjModel, name: Part) -> list[Array]:
+        motors = [m.actuator(motor).id for motor in MOTORS]
+        return {
+            "frictionloss": [m.joint(wheel).frictionloss for wheel in REAR],
+            "damping": [m.joint(wheel).damping for wheel in REAR],
+            "motor damping": [m.actuator_damping[motor : motor + 1] for motor in motors],
+        }[name]
+
+    def equalise(m: mujoco.MjModel, name: Part) -> Iterable[Assignment]:
+        return [(side, np.mean(sides(m, name))) for side in sides(m, name)]
+
+    values = {name: np.ravel(sides(model, name)) for name in ("frictionloss", "damping", "motor damping")}
+    odd = {
+        name: f"{name} {left:g} left, {right:g} right" for name, (left, right) in values.items() if _differ(left, right)
+    }
+    return _suspect(
+        "left and right losses differ", odd, "equation (3) has one loss for both, so make them equal", equalise
+    )
 
 
 def _creep(model: mujoco.MjModel, robot: Robot) -> Suspect | None:

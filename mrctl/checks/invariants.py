@@ -59,7 +59,6 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
     car = Car(model, twist=(_moderate_speed(robot, law), 0))
     data = car.data
     dofs = np.array([model.joint(name).dofadr[0] for name in rolling_wheels(model)])
-    forks = [dof for dof in range(6, model.nv) if dof not in dofs]
     servos = [model.joint("steering").dofadr[0]] if is_steered(model) else []
     rear = robot.drive_loss + robot.rolling_force * (1 - robot.front_load) / 2 * robot.wheel_radius
     front = robot.rolling_force * robot.front_load * robot.front_wheel_radius
@@ -80,7 +79,7 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
             rows = np.zeros(data.nefc)
             mujoco.mj_mulJacVec(model, data, rows, velocity)
             coulombs = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
-            slip = -(data.efc_force * rows)[data.efc_type != coulombs].sum() - data.qfrc_damper[forks] @ velocity[forks]
+            slip = -(data.efc_force * rows)[data.efc_type != coulombs].sum() - data.qfrc_damper[6:] @ velocity[6:]
             servo = data.qfrc_actuator[servos] @ velocity[servos]
             supplied += h * control[:2] @ current
             balance += h * (control[:2] @ current - robot.resistance * current @ current - slip + servo)

@@ -218,8 +218,8 @@ def holding_force(robot: Robot) -> float:
 
 
 def braking(robot: Robot) -> float:
-    """Returns the braking force of the back-EMF of both motors per speed, 2 N² k²/(R_a r²), in N·s/m."""
-    return 2 * robot.motor_gain * robot.back_emf / robot.wheel_radius**2
+    """Returns the braking force of back-EMF and viscous friction per speed, 2 (N² k²/R_a + b)/r², in N·s/m."""
+    return 2 * robot.motor_gain * robot.voltage_per_rate / robot.wheel_radius**2
 
 
 def on_skid_robot(robot: Robot) -> Robot:
@@ -262,9 +262,12 @@ def caster_gaps(model: mujoco.MjModel) -> dict[int, float]:
 
 
 def open_circuit(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy with disconnected motors, which give neither torque nor braking; rotors and losses stay."""
+    """Returns a copy without motor torque and viscous friction; the rotors' inertia and Coulomb losses stay."""
     model = clone(model)
-    model.actuator_gainprm[[model.actuator(name).id for name in MOTORS], 1] = 1e-9
+    motors = [model.actuator(name).id for name in MOTORS]
+    model.actuator_gainprm[motors, 1] = 1e-9
+    model.actuator_damping[motors] = 0
+    model.dof_damping[[model.joint(wheel).dofadr[0] for wheel in REAR]] = 0
     return model
 
 

@@ -44,7 +44,7 @@ def _electronic_differential(robot: Robot, volts: float, angle: float, rate: flo
     """Returns a control whose rear wheels turn as fast as the circle of a rigidly steered front wheel demands."""
     v = robot.velocity_gain * (volts - loss_voltage(robot))
     omega = scrub_free_rotation(v, angle, robot.wheelbase, robot.trail)
-    differential = robot.back_emf * robot.half_track * omega / robot.wheel_radius
+    differential = robot.voltage_per_rate * robot.half_track * omega / robot.wheel_radius
     return volts - differential, volts + differential, angle, rate
 
 

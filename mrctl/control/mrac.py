@@ -329,9 +329,9 @@ class ModelReferenceAdaptive(Learner):
         """Takes the loop, and the settings of each robot."""
         super().__init__(loop, settings)
         rows, (robot, rigid, period, *_) = self.rows, loop
-        emf = inverse_coefficients(robot)[[0, 1], [0, 1]]  # V per m/s and per rad/s
+        per_speed = inverse_coefficients(robot)[[0, 1], [0, 1]]  # V per m/s and per rad/s
         unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
-        weight = np.array([emf[0], STEERING_SHARE if rigid else emf[1]])
+        weight = np.array([per_speed[0], STEERING_SHARE if rigid else per_speed[1]])
         for row, s in zip(rows, settings, strict=True):
             row["r"], row["forgetting"] = s.noise**2 / period, min(period / s.memory, 0.5)
             row["least"], row["M"] = s.spread**-2, s.spread**-2 * np.eye(REGRESSORS)

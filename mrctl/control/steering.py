@@ -119,7 +119,7 @@ def allocate(twist: Array, feedback: Array, feedforward: Array, period: float, r
     if robot.rigid:
         left, right = v - robot.half_track * omega, v + robot.half_track * omega
         losses = np.tanh(right / SIGN_SPEED) - np.tanh(left / SIGN_SPEED)
-        differential = robot.emf * robot.half_track * omega + robot.loss / 2 * losses
+        differential = robot.voltage_per_speed * robot.half_track * omega + robot.loss / 2 * losses
         s.feedback[0], s.feedback[1] = feedback[0], feedback[0]
         omega += feedback[1] + feedforward[1]
     else:

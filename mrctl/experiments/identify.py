@@ -8,7 +8,8 @@ front wheel that steers or trails makes a part of the torque that equation (3) a
     straight on              V̇ = [ (N k/r) (i_d + i_s) − F_c ] / M_e,    V = r (φ̇_d + φ̇_s)/2
     turning                  θ̈ = [ (N k D/r) (i_d − i_s) − m c V θ̇ ] / J_e + constant
 
-with F_c = 2 τ_loss/r + F_roll are fitted by least squares to the lowest harmonics of the signals. An encoder's error is
+with F_c = 2 τ_loss/r + F_roll are fitted by least squares to the lowest harmonics of the signals. (The known viscous
+friction of a robot that has it is taken from the forces first.) An encoder's error is
 bounded in its angle φ and that of a gyro is white in θ̇, so a spectral line at the frequency ω is weighted by 1/ω for
 each derivative that was taken of the sample, which amounts to integrating the equation as often. The noisy signal
 stands alone on the left, where noise does not bias the estimate: when the robot turns, the gyro gives θ̈, and the
@@ -58,8 +59,9 @@ MODEL_ERROR = 0.015  # relative error that effects outside equation (3) may caus
 MAX_HALF_INTERVAL = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
 NOMINAL = Perturbation()
 NOT_IDENTIFIABLE = """\
-For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
-I_0, gear loss and rolling loss, which enter only F_c; N and k_M, which enter only N k (k_E equals k_M in SI units)."""
+For c, the mass m is taken from a scale, and the viscous friction of the wheels is that of their file. These drives
+do not identify m, J_w and J_m, which enter only M_e and J_e; I_0, gear loss and rolling loss, which enter only F_c; N
+and k_M, which enter only N k (k_E equals k_M in SI units)."""
 
 
 class Constant(NamedTuple):
@@ -176,7 +178,7 @@ def identify(
     ahead, turning = (excite(plant, nominal, sensing, random, k == 1) for k, plant in enumerate(plants))
     rows, true = [], plants[0].truth[0]
     for straight, turn in zip(ahead, turning, strict=True):
-        found = drive_constants(straight, nominal.wheel_radius)
+        found = drive_constants(straight, nominal)
         found |= turn_constants(turn, found["R_a"], found["N k"], nominal)
         rows.append(found | {"c": found["m c"] / true.mass})
     facts = {
@@ -326,20 +328,21 @@ def product(first: Lines, second: Lines) -> Lines:
     return np.fft.rfft(values[0] * values[1])[: len(first)] / count
 
 
-def drive_constants(drive: Drive, wheel_radius: float) -> dict[str, float]:
+def drive_constants(drive: Drive, robot: Robot) -> dict[str, float]:
     """Estimates R_a, N k, M_e and F_c from a drive straight on.
 
     Args:
         drive: Measured signals.
-        wheel_radius: Radius of the driven wheels in m.
+        robot: Robot whose wheel radius and viscous friction are taken as known.
     """
     omega = frequencies(len(drive.turn))
     omega[0] = omega[1]  # for the weight of the means; both motors are alike
     speed_per_volt, fall = _fit(omega**-1, drive.wheels.T, drive.voltage.T, -drive.current.T)
     resistance, constant = fall / speed_per_volt, 1 / speed_per_volt
-    force = constant / wheel_radius * _mean_current(drive, resistance).sum(axis=1)
+    v = robot.wheel_radius * drive.wheels.mean(axis=1)
+    force = constant / robot.wheel_radius * _mean_current(drive, resistance).sum(axis=1)
+    force -= 2 * robot.wheel_damping / robot.wheel_radius**2 * average(v)
     loss = force[0].real  # the motion is periodic, so that V̇ is zero in the mean
-    v = wheel_radius * drive.wheels.mean(axis=1)
     (lighter,) = _fit(omega[1:] ** -2, average(derivative(v))[1:], force[1:])
     return {"R_a": float(resistance), "N k": float(constant), "M_e": float(1 / lighter), "F_c": float(loss)}
 
@@ -351,11 +354,12 @@ def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robo
         drive: Measured signals.
         resistance: R_a in Ω.
         constant: N k in N·m/A.
-        robot: Robot whose wheel radius and half track are taken as known.
+        robot: Robot whose wheel radius, half track and viscous friction are taken as known.
     """
     current = _mean_current(drive, resistance)
     torque = constant * robot.half_track / robot.wheel_radius * (current[:, 1] - current[:, 0])
     left, right = robot.wheel_radius * drive.wheels.T
+    torque -= 2 * robot.wheel_damping * (robot.half_track / robot.wheel_radius) ** 2 * average(drive.turn)
     bend = average(product((left + right) / 2, (right - left) / (2 * robot.half_track)))
     nimbler, drag = _fit(1 / frequencies(len(bend))[1:], average(derivative(drive.turn))[1:], torque[1:], -bend[1:])
     return {"J_e": float(1 / nimbler), "m c": float(drag / nimbler)}

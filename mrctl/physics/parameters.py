@@ -33,8 +33,9 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
 
     The front wheel's frictionloss is rolling loss alone and gives the rolling coefficient, which is 0 for a caster that
     slides. A rear wheel's frictionloss is the sum of rolling loss, no-load loss and gearbox loss, and gives the gearbox
-    loss. Equation (3) has one motor: where the two differ, their mean constant, resistance and loss stand for both, as
-    do the left one's gear, rotor inertia, inductance and supply, and the left wheel's inertia.
+    loss. Its joint's damping and its motor's, times gear², add to the viscous friction. Equation (3) has one motor:
+    where the two differ, their mean constant, resistance, loss and viscous friction stand for both, as do the left
+    one's gear, rotor inertia, inductance and supply, and the left wheel's inertia.
 
     Args:
         model: Compiled model.
@@ -61,6 +62,8 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     motor = model.actuator("motor_left")
     resistance, constant = model.actuator_gainprm[[model.actuator(name).id for name in MOTORS], :2].mean(axis=0)
     gear = motor.gear[0]
+    viscous = model.dof_damping[[model.joint(wheel).dofadr[0] for wheel in REAR]]
+    viscous = viscous + gear**2 * model.actuator_damping[[model.actuator(name).id for name in MOTORS]]
     no_load = model.numeric("no_load_current").data[0]
     load = load_torques(model, data)
     if min(load.values()) <= 0:
@@ -92,6 +95,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
         "rotor_inertia": model.actuator_armature[motor.id],
         "no_load_current": no_load,
         "gear_loss": max(0.0, gear_loss),
+        "wheel_damping": viscous.mean(),
         "rolling_coefficient": rolling,
         "wheel_inertia": _spin_inertia(model, "wheel_left"),
         "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in front_wheels),

@@ -8,15 +8,16 @@ The corrected model, with the centre of mass c ahead of P and the front wheel fr
 
     M_e V̇ = (P_d + P_s)/r + m c θ̇² − F_roll (s_d + s_s)/2
     J_e θ̈ = (D/r)(P_d − P_s) − m c V θ̇ − τ_f,     τ_f = D (1 − f) F_roll (s_d − s_s)/2
-    P_i   = (N k_M/R_a)(g U_i − k_E N ω_i) − τ_loss s_i,     ω_i = V_i/r,  V_d,s = V ± D θ̇
+    P_i   = (N k_M/R_a)(g U_i − k_E N ω_i) − b ω_i − τ_loss s_i,     ω_i = V_i/r,  V_d,s = V ± D θ̇
 
 where the subscripts d and s are the right and the left wheel, g is `drive_gain` and U is limited to ±`supply`. The
-losses are modelled so that the inverse is linear in its parameters. s_i is the sign of the speed V_i of a rear wheel,
-and sgn 0 = 0, so that no loss drives a robot at rest. A rear wheel bears (1 − f)/2 of the load, and its rolling loss
-acts on it as the gearbox loss does. The front wheel bears the share f, and its sign is taken as the mean of the two
-others. The rolling force is therefore F_roll where both wheels turn the same way, and the turning resistance τ_f, the
-rolling loss of wheels that turn against each other, needs no parameter of its own. The scrub of the contact patches,
-which would need one, is left out.
+viscous friction b, which the paper does not have, adds its volts per wheel rate to N k_E. The Coulomb losses are
+modelled so that the inverse is linear in its parameters. s_i is the sign of the speed V_i of a rear wheel, and sgn 0 =
+0, so that no loss drives a robot at rest. A rear wheel bears (1 − f)/2 of the load, and its rolling loss acts on it as
+the gearbox loss does. The front wheel bears the share f, and its sign is taken as the mean of the two others. The
+rolling force is therefore F_roll where both wheels turn the same way, and the turning resistance τ_f, the rolling loss
+of wheels that turn against each other, needs no parameter of its own. The scrub of the contact patches, which would
+need one, is left out.
 
 A controller near rest needs the signs smoothed to tanh(V_i/`sign_speed`).
 """
@@ -74,7 +75,7 @@ def wheel_torques(voltage: ArrayLike, twist: ArrayLike, robot: Robot, sign_speed
         (left, right), N·m, shape (…, 2).
     """
     applied = robot.drive_gain * np.clip(np.asarray(voltage, float), -robot.supply, robot.supply)
-    electric = robot.motor_gain * (applied - robot.back_emf * wheel_rates(twist, robot))
+    electric = robot.motor_gain * (applied - robot.voltage_per_rate * wheel_rates(twist, robot))
     return electric - robot.drive_loss * wheel_signs(twist, robot, sign_speed)
 
 
@@ -134,7 +135,7 @@ def inverse_dynamics(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, si
     torque = robot.effective_inertia * omega_dot + lever * v * omega + turning
     wheels = robot.wheel_radius * left_right(stack(force / 2, torque / (2 * robot.half_track)))
     wheels += robot.drive_loss * wheel_signs(twist, robot, sign_speed)
-    return (wheels / robot.motor_gain + robot.back_emf * wheel_rates(twist, robot)) / robot.drive_gain
+    return (wheels / robot.motor_gain + robot.voltage_per_rate * wheel_rates(twist, robot)) / robot.drive_gain
 
 
 def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
@@ -163,9 +164,9 @@ def inverse_coefficients(robot: Robot) -> Array:
     loss = robot.drive_loss / (2 * robot.motor_gain)
     rolling = volts * robot.rolling_force / 2
     along, across = loss + rolling, loss + rolling * (1 - robot.front_load)
-    emf = robot.back_emf / r
-    common = [emf, 0, volts * robot.effective_mass, 0, 0, -lever, along, along]
-    differential = [0, emf * d, 0, volts * robot.effective_inertia / d, lever / d, 0, -across, across]
+    per_speed = robot.voltage_per_rate / r
+    common = [per_speed, 0, volts * robot.effective_mass, 0, 0, -lever, along, along]
+    differential = [0, per_speed * d, 0, volts * robot.effective_inertia / d, lever / d, 0, -across, across]
     return np.array([common, differential]).T / robot.drive_gain
 
 

@@ -71,6 +71,8 @@ class Robot(Record):
     """No-load current of a motor [I_0] in A."""
     gear_loss: NonNegative
     """Coulomb friction of one gearbox, at the wheel, in N·m."""
+    wheel_damping: NonNegative = 0.0
+    """Viscous friction of one drive with its wheel, at the wheel [b] in N·m·s/rad."""
     rolling_coefficient: NonNegative
     """Rolling resistance coefficient, the ratio of resistance to load."""
     wheel_inertia: Positive
@@ -120,6 +122,11 @@ class Robot(Record):
         return self.gear_ratio * self.torque_constant
 
     @property
+    def voltage_per_rate(self) -> float:
+        """Voltage of one drive per wheel rate without load, N k_E + b R_a/(N k_M), in V·s/rad."""
+        return self.back_emf + self.wheel_damping / self.motor_gain
+
+    @property
     def drive_loss(self) -> float:
         """Coulomb torque of one drive at the wheel, τ_loss = N k_M I_0 + gearbox loss, in N·m."""
         return self.back_emf * self.no_load_current + self.gear_loss
@@ -160,7 +167,7 @@ class Robot(Record):
     @property
     def velocity_gain(self) -> float:
         """Static gain of the common channel, V per commanded U_Σ, in m/s/V."""
-        return self.drive_gain * self.wheel_radius / self.back_emf
+        return self.drive_gain * self.wheel_radius / self.voltage_per_rate
 
     @property
     def rotation_gain(self) -> float:
@@ -174,12 +181,12 @@ class Robot(Record):
     @property
     def velocity_time_constant(self) -> float:
         """Time constant of V under U_Σ in s."""
-        return self.effective_mass * self.wheel_radius**2 / (2 * self.motor_gain * self.back_emf)
+        return self.effective_mass * self.wheel_radius**2 / (2 * self.motor_gain * self.voltage_per_rate)
 
     @property
     def rotation_time_constant(self) -> float:
         """Time constant of θ̇ under U_Δ in s, for a feedforward, as `rotation_gain`."""
-        damping = 2 * self.half_track**2 * self.motor_gain * self.back_emf / self.wheel_radius**2
+        damping = 2 * self.half_track**2 * self.motor_gain * self.voltage_per_rate / self.wheel_radius**2
         return self.effective_inertia / damping
 
 

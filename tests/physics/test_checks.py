@@ -90,7 +90,14 @@ def large(model):
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-@pytest.mark.parametrize("change", [heavy, weak, large], ids=lambda f: f.__name__)
+def viscous(model):
+    """Adds viscous friction at both wheels and in both motors, together a quarter of the back-EMF's braking."""
+    for side in ("left", "right"):
+        model.joint(f"wheel_{side}").damping[:] = 0.06
+        model.actuator_damping[model.actuator(f"motor_{side}").id] = 0.05 / 43**2
+
+
+@pytest.mark.parametrize("change", [heavy, weak, large, viscous], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("check", ON_LEVEL, ids=lambda c: c.name)
 def test_other_robots(check, change):
     """Another robot, read from its own model, obeys the same laws: no check is tuned to the shipped one."""

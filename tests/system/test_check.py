@@ -40,7 +40,7 @@ def tyre(side, attributes):
 
 JOINT = '<joint name="wheel_{}"{}/>'
 MOTOR = '<dcmotor name="motor_right" class="motor"'
-AXLE = '<joint axis="0 1 0"{} frictionloss="0.24'
+FRONT_AXLE = '<joint name="front_wheel" axis="0 1 0"'
 FRONT = '<geom name="front_wheel" class="contact" size="{}"/>'
 FORK = 'name="steering" axis="0 0 {}"'
 BOX = '<geom name="belly" type="box" size="0.18 0.12 0.035" pos="0.105 0 -0.0628" contype="1" conaffinity="1"/>'
@@ -64,7 +64,8 @@ FAULTS = {
     "condim": [tyre("left", 'condim="1"'), tyre("right", 'condim="1"')],
     "no pair": [('<pair class="tyre" name="tyre_front" geom1="floor" geom2="front_wheel"/>', "")],
     "axis": [(JOINT.format("right", ""), JOINT.format("right", ' axis="0 -1 0"'))],
-    "damping": [(AXLE.format(""), AXLE.format(' damping="0.02"'))],
+    "damping": [(FRONT_AXLE, FRONT_AXLE + ' damping="0.02"')],
+    "damping of one": [(JOINT.format("left", ""), JOINT.format("left", ' damping="0.02"'))],
     "loss": [(JOINT.format("left", ""), JOINT.format("left", ' frictionloss="0.3"'))],
     "default contacts": [('solref="0.01 1" solreffriction="0.004 1"', "")],
     "pyramid": [('cone="elliptic" impratio="10"', "")],
@@ -93,8 +94,9 @@ DIAGNOSES = {
     "condim": ("limits", "condim of a tyre", "wheel_right has condim 1, which has no friction"),
     "no pair": ("stance", "missing contact pair", "joins front_wheel"),
     "axis": ("limits", "wheel axis", "wheel_right turns about (0, -1, 0)"),
-    "damping": ("coast_down", "drag", "wheel_left has damping 0.02"),
-    "loss": ("stall", "left and right losses differ", "wheel_left has a frictionloss of 0.3 N·m"),
+    "damping": ("coast_down", "drag", "front_wheel has damping 0.02"),
+    "damping of one": ("mirror", "left and right losses differ", "damping 0.02 left, 0 right"),
+    "loss": ("stall", "left and right losses differ", "frictionloss 0.3 left, 0.242462 right"),
     "default contacts": ("scrub_free", "soft contacts", "solref 0.02 s"),
     "pyramid": ("cornering", "soft contacts", "pyramid"),
     "g·cm²": ("inertias", "wheel inertia", "wheel_left is 443 times"),
@@ -176,6 +178,7 @@ def test_nothing_odd():
 
 
 HUB = '<joint name="rear_left_wheel_joint"{}/>'
+ONE_MOTOR = '<dcmotor name="left_motor" class="motor"'
 KNUCKLE = '<default class="knuckle"><joint'
 AXLE, HELD = '<joint axis="0 1 0"', ' range="-9 9" stiffness="1" actuatorfrcrange="-0.3 0.3"'
 LIFTED = '<body gravcomp="1"><geom size="0.01" mass="0.1"/></body>'
@@ -192,10 +195,10 @@ ADOPTED = {
     "turtlebot wheel": (LEFT.format(7.4), LEFT.format(8), "mirror", "left and right wheels differ"),
     "turtlebot swivel": (CASTER, FORK, "centre_of_mass", "swivelling caster"),
     "turtlebot gravcomp": ("<freejoint/>", "<freejoint/>" + LIFTED, "rest", "weight carried from outside"),
-    "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
+    "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "left and right losses differ"),
     "racecar spring": (KNUCKLE, KNUCKLE + ' stiffness="1"', "circle", "spring at the steering"),
     # Under another name the fork of the default robot is one that is steered by a servo, for which its own is too soft.
-    "racecar motor": ('<dcmotor gear="10"', '<dcmotor damping="1e-5" gear="10"', "coast_down", "drag"),
+    "racecar motor": (ONE_MOTOR, ONE_MOTOR + ' damping="1e-5"', "mirror", "left and right losses differ"),
     "car": ('<body name="fork"', '<body name="pivot"', "circle", "soft steering servo"),
 }
 

@@ -1,11 +1,13 @@
 """`mrctl identify` on the physics, in all tiers: intervals hold the truth, for the default robot and others."""
 
 import json
+import shutil
 
 import pytest
 
 from mrctl import InputError, Perturbation, cli
 from mrctl.experiments.identify import identify
+from mrctl.physics.files import models_folder
 from mrctl.sensing.tiers import Sensing
 
 LAB, FIELD = Sensing(tier="lab"), Sensing(tier="field")
@@ -49,6 +51,16 @@ def test_racing_car(capsys):
     assert found["sensing"]["tier"] == "field"
     for row in found["constants"]:
         assert abs(row["error"]) < 0.02 and row["low"] < row["true"] < row["high"], row
+
+
+@pytest.mark.usefixtures("one_period")
+def test_viscous_friction(tmp_path):
+    """The viscous friction that a robot's file states is part of no other constant."""
+    folder = shutil.copytree(models_folder(), tmp_path / "models")
+    text = (folder / "car.xml").read_text()
+    (folder / "car.xml").write_text(text.replace('<joint axis="0 1 0" f', '<joint axis="0 1 0" damping="0.05" f'))
+    for c in identify(str(folder / "flat.xml")):
+        assert abs(c.error) < 0.015 and c.low < c.true < c.high, c
 
 
 @pytest.mark.usefixtures("one_period")

@@ -97,6 +97,18 @@ def test_inverse_of_forward(robot, twist, voltage, sign_speed):
     np.testing.assert_allclose(d.inverse_dynamics(twist, acceleration, weak, sign_speed), voltage, atol=1e-10)
 
 
+@given(twists, st.tuples(st.floats(-24, 24), st.floats(-24, 24)))
+def test_viscous_friction(robot, twist, voltage):
+    """It takes b ω from the torque of each drive, and the inverse dynamics gives the volts for that."""
+    sticky = robot.model_copy(update={"wheel_damping": 0.07})
+    less = d.wheel_torques(voltage, twist, robot) - d.wheel_torques(voltage, twist, sticky)
+    np.testing.assert_allclose(less, 0.07 * wheel_rates(twist, robot), atol=1e-12)
+    acceleration = d.accelerations(twist, voltage, sticky)
+    np.testing.assert_allclose(d.inverse_dynamics(twist, acceleration, sticky), voltage, atol=1e-9)
+    mixed = d.regressor(twist, acceleration, sticky) @ d.inverse_coefficients(sticky)
+    np.testing.assert_allclose(d.left_right(mixed), voltage, atol=1e-9)
+
+
 @given(twists, st.tuples(speeds, rotations), smoothing)
 def test_regressor_linear(robot, twist, acceleration, sign_speed):
     """Eight features and their coefficients are the inverse dynamics."""

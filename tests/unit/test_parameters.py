@@ -74,6 +74,27 @@ def test_exact():
         assert getattr(BASE, name) == pytest.approx(PUBLISHED[name], rel=2e-5)
 
 
+def test_viscous_friction():
+    """The damping of a joint adds to its motor's, times gear²; a lifted wheel runs free at N k U/(N² k² + b R_a)."""
+    model = mjcf.clone(NOMINAL)
+    motors = [model.actuator(f"motor_{side}").id for side in ("left", "right")]
+    wheels = [model.joint(f"wheel_{side}").dofadr[0] for side in ("left", "right")]
+    model.dof_damping[wheels], model.actuator_damping[motors] = [0.05, 0.07], 0.04 / 43**2
+    model.dof_frictionloss[:], model.numeric("no_load_current").data[:], model.opt.gravity[:] = 0, 0, 0
+    data = mujoco.MjData(model)
+    data.ctrl[model.actuator_ctrladr[motors]] = 24, 24
+    while data.time < 3:
+        mujoco.mj_step(model, data)
+    model.opt.gravity[2] = -9.81
+    robot = read_robot(model)
+    assert robot.wheel_damping == pytest.approx(0.10, rel=1e-12)
+    constant = 43 * 0.0234
+    free = [constant * 24 / (constant**2 + b * 2.32) for b in (0.09, 0.11)]
+    np.testing.assert_allclose(data.qvel[wheels], free, rtol=1e-6)
+    assert robot.voltage_per_rate == pytest.approx(constant + 0.10 * 2.32 / constant, rel=1e-12)
+    assert (BASE.wheel_damping, BASE.voltage_per_rate) == (0, BASE.back_emf)
+
+
 def test_motor_limits():
     """The no-load speed is 2.34 m/s and the stall torque 10.4 N·m."""
     assert BASE.supply * BASE.velocity_gain == pytest.approx(2.34, abs=5e-3)
