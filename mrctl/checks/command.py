@@ -21,7 +21,7 @@ from mrctl.physics.elements import has
 from mrctl.physics.files import SHIPPED, world_path
 from mrctl.physics.mjcf import REQUIRED, arrangement, load, load_robot, steerings
 
-MAX_SECONDS = 28.0  # s by the clock for loading, all checks and explanations; those that are left then fail
+MAX_SECONDS = 28.0  # s of processor time for loading, all checks and explanations; those that are left then fail
 UNEXPLAINED = "no inspection explains this, nor does a shorter time step"
 
 

@@ -58,7 +58,7 @@ class TooLong(Exception):
 
 
 _deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)  # s of processor time
-_end: ContextVar[float] = ContextVar("end", default=math.inf)  # s of the clock
+_end: ContextVar[float] = ContextVar("end", default=math.inf)  # s of processor time, for all checks together
 
 
 @contextlib.contextmanager
@@ -73,8 +73,8 @@ def limited(seconds: float) -> Iterator[None]:
 
 @contextlib.contextmanager
 def ending(seconds: float) -> Iterator[None]:
-    """Limits the time by the clock on the wall that all checks together may take from now on, in s."""
-    token = _end.set(time.monotonic() + seconds)
+    """Limits the processor time that all checks together may take from now on, in s."""
+    token = _end.set(time.process_time() + seconds)
     try:
         yield
     finally:
@@ -82,8 +82,8 @@ def ending(seconds: float) -> Iterator[None]:
 
 
 def ended() -> bool:
-    """Tells whether the time by the clock is up."""
-    return time.monotonic() > _end.get()
+    """Tells whether the time of all checks together is up."""
+    return time.process_time() > _end.get()
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Car:
         qpos, qvel = np.empty((ticks + 1, self.model.nq)), np.empty((ticks + 1, self.model.nv))
         qpos[0], qvel[0] = self.data.qpos, self.data.qvel
         for k in range(ticks):
-            if time.process_time() > _deadline.get() or ended():
+            if time.process_time() > min(_deadline.get(), _end.get()):
                 raise TooLong("its time is up")
             self.control(law(k * hold))
             mujoco.mj_step(self.model, self.data, substeps)

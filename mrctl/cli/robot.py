@@ -26,9 +26,9 @@ def check(
     chassis: str = "",
     json: bool = False,
 ) -> None:
-    """Runs the physics checks on a robot in at most 30 s, and names the likely cause of a failure in its model.
+    """Runs the physics checks on a robot and names the likely cause of a failure in its model.
 
-    The exit status is 1 if a check fails.
+    That takes at most 30 s of processor time. The exit status is 1 if a check fails.
 
     Args:
         robot: The car, turtlebot or racecar, or the MJCF file of a robot, with or without a floor; by default the car.

@@ -115,7 +115,12 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     if gear_loss < -1e-9:
         wrong = mistake(model, robot)
         reason = f"; {wrong.text}" if wrong else ""
-        raise InputError(f"frictionloss: a rear wheel's is smaller than its rolling and no-load losses{reason}")
+        has_loss = np.mean([model.joint(wheel).frictionloss[0] for wheel in REAR])
+        raise InputError(
+            f"frictionloss: a rear wheel's, {has_loss:.3g} N·m, is smaller than its rolling and no-load losses of "
+            f"{has_loss - gear_loss:.3g} N·m; the rolling loss follows from the frictionloss and the load of the front "
+            f"wheels{reason}"
+        )
     return robot
 
 

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import mujoco
 import pytest
@@ -363,10 +364,11 @@ def test_all_checks():
     }  # fmt: skip
 
 
-def test_the_whole_ends_by_the_clock(monkeypatch, capsys):
-    """However little processor time a busy machine gives, checks that are left after 28 s fail with their text."""
-    now = iter(range(0, 10_000_000, 5))  # every look at the clock takes 5 s
-    monkeypatch.setattr("mrctl.checks.open_loop.time.monotonic", lambda: float(next(now)))
+def test_the_whole_ends(monkeypatch, capsys):
+    """Checks that are left after 28 s of processor time fail with their text; a busy machine takes nothing from it."""
+    used = iter(range(0, 10_000_000, 5))  # every look at the processor's time takes 5 s
+    clock = SimpleNamespace(process_time=lambda: float(next(used)), monotonic=None)
+    monkeypatch.setattr("mrctl.checks.open_loop.time", clock)
     text, verdict = command.run("flat", json=True)
     checks = json.loads(text)["checks"]
     late = [check for check in checks if any("its time is up" in value["quantity"] for value in check["values"])]
@@ -375,7 +377,7 @@ def test_the_whole_ends_by_the_clock(monkeypatch, capsys):
     monkeypatch.undo()
     with pytest.raises(SystemExit):
         main(["check", "--help"])
-    assert "in at most 30 s" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "at most 30 s of processor time" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
 def test_a_warning_is_said_once(tmp_path, monkeypatch, capfd):

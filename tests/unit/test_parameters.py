@@ -74,6 +74,16 @@ def test_exact():
         assert getattr(BASE, name) == pytest.approx(PUBLISHED[name], rel=2e-5)
 
 
+def test_too_little_friction():
+    """A rear wheel with the front wheel's frictionloss has less than rolls away under its larger load."""
+    model = mjcf.clone(NOMINAL)
+    for side in ("left", "right"):
+        model.joint(f"wheel_{side}").frictionloss[:] = 0.059655
+    rolling, no_load = 0.015 * 20 * 9.81 * (1 - 0.1 / 0.37) / 2 * 0.098, 43 * 0.0234 * 0.037
+    with pytest.raises(InputError, match=rf"0\.0597 N·m, is smaller than .* losses of {rolling + no_load:.3g} N·m"):
+        read_robot(model)
+
+
 def test_viscous_friction():
     """The damping of a joint adds to its motor's, times gear²; a lifted wheel runs free at N k U/(N² k² + b R_a)."""
     model = mjcf.clone(NOMINAL)
