@@ -19,7 +19,7 @@ import numpy as np
 
 from mrctl.checks import drive, invariants, plausibility, wheels, worlds
 from mrctl.checks.comparison import CheckFailed, Report, compare
-from mrctl.checks.open_loop import Unstable, holding_force, is_steered
+from mrctl.checks.open_loop import Unstable, is_steered
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
 from mrctl.theory.robot import Robot, Steering
@@ -33,14 +33,14 @@ class Check(NamedTuple):
         world: World that it needs; `flat` stands for any level floor.
         steering: Steering arrangement in which it drives a robot that offers several.
         front: Kind of front wheel or caster that it needs; "load ahead" of the driven axle has the centre of mass, too.
-        losses: Whether it needs Coulomb losses.
+        unless: Tells from a robot's parameters why it does not suit the robot, if that is so, or else returns "".
     """
 
     function: Callable[[mujoco.MjModel, Robot], Report]
     world: str
     steering: Steering
     front: Literal["any", "steered", "without trail", "following", "trailing fork", "load ahead"] = "any"
-    losses: bool = False
+    unless: Callable[[Robot], str] | None = None
 
     @property
     def name(self) -> str:
@@ -59,9 +59,7 @@ class Check(NamedTuple):
             return "no trailing fork"
         if self.front == "load ahead" and read_robot(model).com_offset < 0:
             return "the centre of mass is behind the driven axle, where free rolling is unstable"
-        if self.losses and holding_force(read_robot(model)) == 0:
-            return "the robot has no Coulomb losses"
-        return ""
+        return self.unless(read_robot(model)) if self.unless else ""
 
     def measure(self, model: mujoco.MjModel, robot: Robot) -> Report:
         """Measures all values, and returns them whether they pass or not."""
@@ -95,15 +93,15 @@ CHECKS = (
     Check(plausibility.motors, "flat", "compliant"),
     Check(plausibility.inertias, "flat", "compliant"),
     Check(wheels.rest, "flat", "compliant"),
-    Check(drive.hold_on_slope, "flat", "compliant", losses=True),
+    Check(drive.hold_on_slope, "flat", "compliant", unless=drive.holds_on_no_slope),
     Check(drive.top_speed, "flat", "compliant"),
     Check(drive.stall, "flat", "rigid"),
     Check(drive.velocity_time_constant, "flat", "compliant"),
     Check(drive.rotation_time_constant, "flat", "rigid"),
-    Check(drive.coast_down, "flat", "compliant", "load ahead", losses=True),
+    Check(drive.coast_down, "flat", "compliant", "load ahead", unless=drive.rolls_freely),
     Check(wheels.circle, "flat", "rigid", "steered"),
     Check(wheels.rolling, "flat", "rigid", "without trail"),
-    Check(wheels.traction, "flat", "compliant"),
+    Check(wheels.traction, "flat", "compliant", unless=wheels.hardly_spins),
     Check(wheels.cornering, "flat", "rigid", "steered"),
     Check(drive.centre_of_mass, "flat", "rigid", "load ahead"),
     Check(drive.prediction, "flat", "caster", "following"),

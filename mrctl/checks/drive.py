@@ -30,7 +30,7 @@ from mrctl.physics.elements import REAR
 from mrctl.physics.readout import motor_parameters
 from mrctl.theory.dynamics import accelerations
 from mrctl.theory.kinematics import wheel_rates
-from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.perturbation import MAX_SLOPE, Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
 
 
@@ -55,6 +55,18 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
         compare("creep at half the holding force", standing, 0.0, "m/s", absolute=0.1 * force / 2 / braking(robot)),
         compare(f"speed at {steepest:.3g} times the holding force", rolling, terminal, "m/s", absolute=tolerance),
     ]
+
+
+def rolls_freely(robot: Robot) -> str:
+    """Returns why a robot without Coulomb losses cannot be judged by them, or "" for another."""
+    return "" if holding_force(robot) else "the robot has no Coulomb losses"
+
+
+def holds_on_no_slope(robot: Robot) -> str:
+    """Returns why a robot cannot be judged by the slope that it holds on, or ""."""
+    if _steepest(robot) * holding_force(robot) > robot.mass * GRAVITY * np.sin(MAX_SLOPE):
+        return f"its losses hold the robot on all slopes up to {MAX_SLOPE:g} rad"
+    return rolls_freely(robot)
 
 
 def _steepest(robot: Robot) -> float:

@@ -9,7 +9,16 @@ import mujoco
 import numpy as np
 
 from mrctl.checks.comparison import Report, compare
-from mrctl.checks.open_loop import HOLD_TIME, NO_CONTROL, Car, crisp, loss_voltage, perturbed, settling_time
+from mrctl.checks.open_loop import (
+    HOLD_TIME,
+    NO_CONTROL,
+    Car,
+    crisp,
+    loss_voltage,
+    on_skid_robot,
+    perturbed,
+    settling_time,
+)
 from mrctl.physics.elements import fronts
 from mrctl.theory.kinematics import scrub_free_angle, scrub_free_rotation, twist_from_front_wheel, wheel_rates
 from mrctl.theory.perturbation import Perturbation
@@ -145,6 +154,17 @@ def traction(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     slippery = perturbed(model, Perturbation(tyre_friction_factor=0.2))
     return spinning_wheels(slippery, robot, 0.2 * robot.tyre_friction)
+
+
+def hardly_spins(robot: Robot) -> str:
+    """Returns why full voltage does not spin the wheels well enough for `traction`, or "".
+
+    Against the grip the wheels reach a share 1 − F_grip/F_stall of their free speed, and the robot, in `traction`, half
+    of it.
+    """
+    stall = 2 * (robot.motor_gain * robot.supply - on_skid_robot(robot).drive_loss) / robot.wheel_radius
+    grip = 0.2 * robot.tyre_friction * robot.mass * GRAVITY * (1 - robot.front_load)
+    return "" if grip < 0.3 * stall else "the motors hardly spin the wheels on a fifth of their grip"
 
 
 def cornering(model: mujoco.MjModel, robot: Robot) -> Report:

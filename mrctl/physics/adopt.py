@@ -447,6 +447,7 @@ class _Adoption:
                     f"equality: couples {_listed(self.wheels)}; mrctl drives the wheels apart from each other, with "
                     "different speeds in a turn, so take it out"
                 )
+        self._strip_tendons()
         steering = [a for a in spec.actuators if a.target in self.steered]
         coupled = [e for e in spec.equalities if {e.name1, e.name2} & {*self.steered, *self.wheels}]
         for element in [*spec.sensors, *spec.keys, *spec.pairs, *spec.excludes, *steering, *coupled]:
@@ -460,6 +461,30 @@ class _Adoption:
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
             geom.group = geom.group or 1  # rays that look for the ground see only group 0
+
+    def _strip_tendons(self) -> None:
+        """Removes tendons over driven or steered wheels that do nothing, and refuses those that move the wheels.
+
+        MuJoCo's own sample car has two, over which it drives its wheels, and which do nothing once the wheels have
+        motors of their own.
+        """
+        model, spec = self.model, self.spec
+        wheels = {model.joint(name).id: name for name in (*self.steered, *self.wheels)}
+        for index, tendon in enumerate(list(spec.tendons)):
+            wraps = slice(model.tendon_adr[index], model.tendon_adr[index] + model.tendon_num[index])
+            on_joints = model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_JOINT
+            over = [wheels[joint] for joint in model.wrap_objid[wraps][on_joints] if joint in wheels]
+            if not over:
+                continue
+            pulled = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON}
+            held = {n for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_TENDON for n in (e.name1, e.name2)} - {""}
+            fields = ("stiffness", "damping", "frictionloss", "armature", "limited", "actfrclimited")
+            if tendon.name in pulled | held or any(getattr(model, f"tendon_{field}")[index].any() for field in fields):
+                raise InputError(
+                    f"tendon: {tendon.name!r} moves {_listed(over)}; mrctl drives each wheel by a <dcmotor> of its "
+                    "own, so take the tendon out"
+                )
+            spec.delete(tendon)
 
     def _align(self) -> None:
         """Moves the chassis' frame to P, with x ahead and z up.

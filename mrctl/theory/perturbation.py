@@ -27,6 +27,9 @@ from mrctl.theory.drive import (
 MAX_DELAY = 0.5
 """Longest delay or latency in s; those of sensing and perturbation add, so that a command may take twice as long."""
 
+MAX_SLOPE = 0.5
+"""Largest inclination of the ground in rad."""
+
 Factor = Annotated[float, Field(ge=0.05, le=20)]
 
 
@@ -92,7 +95,7 @@ class Perturbation(Record):
     """Factor on the friction of every tyre on the floor."""
     left_tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
     """Further factor on the friction of the rear left tyre."""
-    slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    slope: Annotated[float, Field(ge=-MAX_SLOPE, le=MAX_SLOPE)] = 0.0
     """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=MAX_DELAY)] = 0.0
     """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""

@@ -158,6 +158,24 @@ def test_no_losses(name):
         assert check.unsuited(model) == "the robot has no Coulomb losses" and not check.unsuited(load())
 
 
+def test_weak_motors_and_strong_losses():
+    """Checks that drive a robot to what it cannot do do not suit it, up to where it can."""
+    slope, traction = (next(c for c in CHECKS if c.name == name) for name in ("hold_on_slope", "traction"))
+    model, resistance = load(), 2.32
+    stall = 2 * (24 * 43 * 0.0234 / resistance - 0.23) / 0.098  # N, with rolling loss
+    grip = 0.2 * 0.9 * 20 * 9.81 * (1 - 0.1 / 0.37)
+    for factor, said in ((0.9, ""), (1.2, "the motors hardly spin the wheels on a fifth of their grip")):
+        model.actuator_gainprm[[model.actuator(f"motor_{side}").id for side in ("left", "right")], 0] = (
+            factor * resistance * 0.3 * stall / grip
+        )
+        assert traction.unsuited(model) == said
+    held = 20 * 9.81 * np.sin(0.5) / 1.1  # N; a tenth more is the least that `hold_on_slope` lets pull the robot down
+    for factor, said in ((0.95, ""), (1.05, "its losses hold the robot on all slopes up to 0.5 rad")):
+        for side in ("left", "right"):
+            model.joint(f"wheel_{side}").frictionloss[:] = factor * held / 2 * 0.098
+        assert slope.unsuited(model) == said
+
+
 @pytest.mark.parametrize("name", ["stall", "energy", "velocity_time_constant", "rotation_time_constant"])
 def test_inductance(tmp_path, name):
     """The current of a winding follows within L/R, here 2 ms, which changes neither stall torque, balance nor lag."""

@@ -51,6 +51,8 @@ CAR = (
     + KNUCKLE.format("s1", "0.5 0.2 0", wheel("c", "0 0 0", loss=0.02))
     + KNUCKLE.format("s2", "0.5 -0.2 0", wheel("d", "0 0 0", loss=0.02))
 )  # fmt: skip
+TENDONS = """<tendon><fixed name="turn" {}><joint joint="a" coef="-0.5"/><joint joint="b" coef="0.5"/></fixed>
+  <fixed><joint joint="a" coef="0.5"/><joint joint="b" coef="0.5"/></fixed></tendon>"""
 TRICYCLE = (
     "<freejoint/>" + BOX.format(0.15) + wheel("a", "0 0.2 0") + wheel("b", "0 -0.2 0")
     + KNUCKLE.format("s1", "0.5 0 0", wheel("c", "0 0 0", loss=0.02))
@@ -279,6 +281,12 @@ def test_camera_that_looks_at_a_body(file):
     camera = '<camera pos="-1 0 1" mode="targetbody" target="base"/>'
     _, model = read(file(document(DIFF + camera, MOTORS)))
     assert model.cam_targetbodyid.tolist() == [model.body("chassis").id]
+
+
+def test_idle_tendons(file):
+    """Tendons over the wheels that nothing pulls, as those of MuJoCo's sample car, change nothing."""
+    own, without = (read(file(document(DIFF, MOTORS, extra=extra))) for extra in (TENDONS.format(""), ""))
+    assert own[0] == without[0] and (own[1].ntendon, own[1].nv) == (0, without[1].nv)
 
 
 def test_linkage_with_one_servo(file):
@@ -564,6 +572,11 @@ ERRORS = {
         document(DIFF, MOTORS).replace(
             "</mujoco>", '<equality><joint joint1="a" joint2="b"/></equality></mujoco>'), {},
         ("equality", "'a', 'b'", "apart")),
+    "stretched tendon": (document(DIFF, MOTORS).replace("</mujoco>", TENDONS.format('stiffness="1"') + "</mujoco>"), {},
+        ("tendon", "'turn'", "'a', 'b'", "take the tendon out")),
+    "pulled tendon": (document(DIFF, MOTORS + '<motor tendon="turn"/>').replace(
+            "</mujoco>", TENDONS.format("") + "</mujoco>"), {},
+        ("tendon", "'turn'", "'a', 'b'", "take the tendon out")),
     "wheels that lie": (document(DIFF.replace('euler="90 0 0"', ""), MOTORS), {}, ("wheels", "joint 'a'", "lies flat")),
     "third wheel on a fixed axle": (
         document(DIFF.replace(BALL.format(0.3), wheel("f", "0.3 0 0")), MOTORS), {}, ("caster", "'f'", "fixed axle")),
