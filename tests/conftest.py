@@ -25,12 +25,6 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Python's garbage collector took an eighth of the time of all tests.
 gc.set_threshold(50_000, 20, 100)
 
-
-def pytest_xdist_auto_num_workers() -> int:
-    """Returns one worker more than cores, as some tests wait for a browser, a server or their own processes."""
-    return len(os.sched_getaffinity(0)) + 1
-
-
 COMPILE = """
 import sys
 
