@@ -14,13 +14,13 @@ from mrctl.theory.robot import CAR, Robot, RobotFile
 
 def integrate(robot: Robot, volts, start):
     """V, θ̇, distance and heading at the ticks `(N + 1, B, 4)` under voltages `(N, B, 2)`, wheels turning forwards."""
-    r, d, k = robot.wheel_radius, robot.half_track, robot.back_emf
+    r, d, k, b = robot.wheel_radius, robot.half_track, robot.back_emf, robot.wheel_damping
     lever, loss = robot.mass * robot.com_offset, 2 * robot.drive_loss / r + robot.rolling_force
 
     def rate(state, left, right):
         v, omega = state[:2]
-        pull = k / r / robot.resistance * (left + right - 2 * k * v / r)
-        twist = d * k / r / robot.resistance * (right - left - 2 * k * d * omega / r)
+        pull = k / r / robot.resistance * (left + right - 2 * k * v / r) - 2 * b * v / r**2
+        twist = d * k / r / robot.resistance * (right - left - 2 * k * d * omega / r) - 2 * b * d**2 * omega / r**2
         v_dot = (pull + lever * omega**2 - loss) / robot.effective_mass
         return np.stack([v_dot, (twist - lever * v * omega) / robot.effective_inertia, v, omega])
 
@@ -68,7 +68,7 @@ def truths(robot):
 
 
 def constants(robot, straight, turn):
-    found = drive_constants(straight, robot.wheel_radius)
+    found = drive_constants(straight, robot)
     return found | turn_constants(turn, found["R_a"], found["N k"], robot)
 
 
@@ -102,9 +102,10 @@ def test_average_and_product():
     np.testing.assert_allclose(identify.product(first, second), expected, atol=1e-12)
 
 
-def test_exact(robot):
+@pytest.mark.parametrize("damping", [0.0, 0.08])
+def test_exact(robot, damping):
     """Without noise every constant comes back; 0.2 % is what straight lines for currents within a tick cost."""
-    random = np.random.default_rng(1)
+    random, robot = np.random.default_rng(1), robot.model_copy(update={"wheel_damping": damping})
     ahead, turning = (drives(robot, 2, random, turns) for turns in (False, True))
     for pair in zip(ahead, turning, strict=True):
         assert constants(robot, *pair) == pytest.approx(truths(robot), rel=2e-3)
