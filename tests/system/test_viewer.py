@@ -323,7 +323,12 @@ def test_live(browser, tmp_path):
         button = page.get_by_role("button", name="reset", exact=True)
         until(lambda: (box := button.bounding_box()) and box["height"] >= 44, "a button for a finger")
         score, drive = page.locator("#mrctl-score"), page.get_by_role("tab", name="Drive")
-        until(lambda: 844 / 2 < score.bounding_box()["y"] < drive.bounding_box()["y"] < 800, "the score in the panel")
+
+        def in_panel():
+            upper, lower = score.bounding_box(), drive.bounding_box()  # None while the page is laid out anew
+            return upper and lower and 844 / 2 < upper["y"] < lower["y"] < 800
+
+        until(in_panel, "the score in the panel")
         assert page.get_by_label("panel Curves").bounding_box()["height"] >= 44
         boxes = [box.bounding_box() for box in page.locator("input[type=checkbox]").all() if box.is_visible()]
         assert len(boxes) > 2 and all(min(box["width"], box["height"]) >= 44 for box in boxes)

@@ -130,9 +130,9 @@ def test_perturbation_random(values):
 
 
 def test_robot_needs_everything(robot):
-    """A missing parameter is refused by name; only drive gain, gravity and a fork beside its trail have a default."""
+    """A missing parameter is refused by name, but for those with a default: what few robots have, and gravity."""
     fork = {"steering_stiffness", "steering_damping", "fork_inertia", "fork_moment"}
-    for field in Robot.model_fields.keys() - {"drive_gain", "gravity"} - fork:
+    for field in Robot.model_fields.keys() - {"drive_gain", "gravity", "wheel_damping"} - fork:
         values = robot.model_dump()
         del values[field]
         with pytest.raises(InputError, match=rf"^{field}: "):
