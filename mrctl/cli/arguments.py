@@ -36,7 +36,7 @@ CONTROLLER_OF_VIEW = (
 )
 """Message for a controller of the user in a live session, with the command that drives it."""
 
-POSE_FLAGS = "--goal", "--start", "--initial-pose"
+POSE_FLAGS = "--goal", "--start", "--initial-pose", "--initial-spread"
 """Flags whose values may be written as x,y,θ."""
 
 LIST_FLAGS = "--controller", "--feedforward", "--compare", "--delay", "--tier"

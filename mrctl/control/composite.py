@@ -1,6 +1,6 @@
 """Composite adaptation: weights of physical features follow prediction errors and tracking errors.
 
-    U = φ(x)ᵀ a + d,      φ = 8 features of the inverse dynamics, cosine and sine of the heading,    a(0) = 0, d(0) = 0
+    U = φ(x)ᵀ a + d,      φ = V, θ̇, V̇, θ̈, V θ̇, θ̇², s_l, s_r, cos θ, sin θ,      a(0) = 0, d(0) = 0
 
 A Kalman filter (`predict`) estimates the weights a and the disturbance d from the voltage that acted and the motion
 that followed, both low-passed; the tracking term (`track`) moves a by a share of the feedback voltage e:
@@ -8,8 +8,9 @@ that followed, both low-passed; the tracking term (`track`) moves a by a share o
     U_f = prior(x_f) + φ(x_f)ᵀ a + d + noise,      x_f = (V_f, V̇_f)
     a ← a + P φ(x_c) · step · e / (φ(x_c)ᵀ P φ(x_c)),      x_c = commanded motion that e answers (`matching.recall`)
 
-Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) do so
-with a Kalman filter. The weights of cosine and sine of the heading are gravity on a slope of any direction.
+s_l and s_r are smoothed signs of the speeds of the wheels. Slotine and Li (1989) combine the two errors; Neural-Fly
+(O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) do so with a Kalman filter. The weights of cosine and sine of
+the heading are gravity on a slope of any direction.
 
 Voltage and motion pass the same two first-order filters. V̇_f is the input of the second filter less its output, over
 its time constant, so that nothing is differentiated. With only one filter, V̇_f would contain the noise of V unfiltered,

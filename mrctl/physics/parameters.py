@@ -67,7 +67,11 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     no_load = model.numeric("no_load_current").data[0]
     load = load_torques(model, data)
     if min(load.values()) <= 0:
-        found = "com_offset: the centre of mass must lie over the triangle of the wheels"
+        found = (
+            f"com_offset: the centre of mass must lie over the triangle of the wheels; it lies {1e3 * com[0]:.4g} mm "
+            f"ahead of the driven axle and {1e3 * com[1]:.4g} mm to the left, and the front wheel or caster touches "
+            f"the ground {1e3 * (wheelbase - trail):.4g} mm ahead"
+        )
         raise InputError("; ".join(filter(None, (found, too_long(model, half_track)))))
     rolling = 0.0
     if front_wheels:

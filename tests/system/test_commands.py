@@ -369,6 +369,7 @@ def test_bad_scenario_is_one_line(
         (["suite", "--feedforward", "foo"], "feedforward: 'foo' is none of composite, fel, hindsight, model, model+c"),
         (["navigate", "doorway:3", "--goal", "1"], "goal: expected"),
         (["run", "--initial-pose", "1,2"], "initial-pose: 1,2 is not x, y and θ"),
+        (["run", "--initial-spread", "0,0"], "initial-spread: 0,0 is not x, y and θ"),
         (["navigate", "doorway:3", "--speed", "15"], "speed: must be between 0.01 and 1.5 m/s, not 15"),
         (["navigate", ".", "--goal", "1,0,0"], ".: holds no mission"),
         (["navigate", "--suite", "--port", "9000"], "port: belongs to --view"),

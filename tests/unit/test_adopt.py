@@ -597,7 +597,8 @@ ERRORS = {
     "wheel ahead of its axis": (
         document(TRICYCLE.replace(wheel("c", "0 0 0", loss=0.02), wheel("c", "0.01 0 0", loss=0.02)),
                  MOTORS + SERVO.format("s1")), {}, ("steering", "10 mm ahead")),
-    "tips over": (document(DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"'), MOTORS), {}, ("com_offset",)),
+    "tips over": (document(DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"'), MOTORS), {},
+        ("com_offset", f"{-1000 * 10 * 0.1 / 14:.4g} mm ahead of the driven axle and 0 mm", "ground 300 mm ahead")),
     "not MJCF": ("<urdf/>", {}, ("mine.xml",)),
     "limits": (
         document(DIFF, MOTORS, extra='<custom><numeric name="limits" data="1 2"/></custom>'), {}, ("limits", "4")),
