@@ -93,7 +93,7 @@ CHECKS = (
     Check(plausibility.motors, "flat", "compliant"),
     Check(plausibility.inertias, "flat", "compliant"),
     Check(wheels.rest, "flat", "compliant"),
-    Check(drive.hold_on_slope, "flat", "compliant", unless=drive.holds_on_no_slope),
+    Check(drive.hold_on_slope, "flat", "compliant", unless=drive.holds_on_all_slopes),
     Check(drive.top_speed, "flat", "compliant"),
     Check(drive.stall, "flat", "rigid"),
     Check(drive.velocity_time_constant, "flat", "compliant"),

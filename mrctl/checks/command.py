@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from mrctl.checks.comparison import Comparison
 from mrctl.checks.examination import Examination, Finding, excess
-from mrctl.checks.open_loop import ending
+from mrctl.checks.open_loop import limited
 from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import has
 from mrctl.physics.files import SHIPPED, world_path
@@ -80,7 +80,7 @@ def run(
     Raises:
         InputError: The robot cannot be loaded.
     """
-    with ending(MAX_SECONDS):
+    with limited(MAX_SECONDS):
         robot = examination(path, wheels, steering, chassis)
         findings = [robot.examine(check) for check in tqdm(robot.checks, unit="check")]
     failed = sum(finding.status == "failed" for finding in findings)

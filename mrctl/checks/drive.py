@@ -62,8 +62,8 @@ def rolls_freely(robot: Robot) -> str:
     return "" if holding_force(robot) else "the robot has no Coulomb losses"
 
 
-def holds_on_no_slope(robot: Robot) -> str:
-    """Returns why a robot cannot be judged by the slope that it holds on, or ""."""
+def holds_on_all_slopes(robot: Robot) -> str:
+    """Returns why a robot that holds on all slopes cannot be judged by the steepest one, or "" for another."""
     if _steepest(robot) * holding_force(robot) > robot.mass * GRAVITY * np.sin(MAX_SLOPE):
         return f"its losses hold the robot on all slopes up to {MAX_SLOPE:g} rad"
     return rolls_freely(robot)

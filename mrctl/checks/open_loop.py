@@ -58,32 +58,21 @@ class TooLong(Exception):
 
 
 _deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)  # s of processor time
-_end: ContextVar[float] = ContextVar("end", default=math.inf)  # s of processor time, for all checks together
 
 
 @contextlib.contextmanager
 def limited(seconds: float) -> Iterator[None]:
-    """Limits the processor time that the drives of a check may take, in s."""
-    token = _deadline.set(time.process_time() + seconds)
+    """Limits the processor time in s that what is done within may take; a limit around it stays in force."""
+    token = _deadline.set(min(_deadline.get(), time.process_time() + seconds))
     try:
         yield
     finally:
         _deadline.reset(token)
 
 
-@contextlib.contextmanager
-def ending(seconds: float) -> Iterator[None]:
-    """Limits the processor time that all checks together may take from now on, in s."""
-    token = _end.set(time.process_time() + seconds)
-    try:
-        yield
-    finally:
-        _end.reset(token)
-
-
 def ended() -> bool:
-    """Tells whether the time of all checks together is up."""
-    return time.process_time() > _end.get()
+    """Tells whether the time is up."""
+    return time.process_time() > _deadline.get()
 
 
 @dataclass(frozen=True)
@@ -147,7 +136,7 @@ class Car:
         qpos, qvel = np.empty((ticks + 1, self.model.nq)), np.empty((ticks + 1, self.model.nv))
         qpos[0], qvel[0] = self.data.qpos, self.data.qvel
         for k in range(ticks):
-            if time.process_time() > min(_deadline.get(), _end.get()):
+            if ended():
                 raise TooLong("its time is up")
             self.control(law(k * hold))
             mujoco.mj_step(self.model, self.data, substeps)
